@@ -39,7 +39,7 @@ import yaml
 from mtv_world_ros.core.errors import SimulatorError
 from mtv_world_ros.core.files import bundled
 from mtv_world_ros.core.images import resize_frames
-from mtv_world_ros.ranking.rollout_jobs import Result
+from mtv_world_ros.ranking.jobs import Result
 from mtv_world_ros.ranking.run_jobs import read_results
 from mtv_world_ros.robot.file import load_robot
 from mtv_world_ros.robot.resample import resample

@@ -19,8 +19,8 @@ from pathlib import Path
 from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.documents import DASH, Table
 from mtv_world_ros.core.errors import ConfigError
+from mtv_world_ros.ranking.jobs import Result
 from mtv_world_ros.ranking.judges import JUDGES, RULE, Score, scores, true_rate
-from mtv_world_ros.ranking.rollout_jobs import Result
 from mtv_world_ros.ranking.run_jobs import FOLDER
 
 HEAD = ('rankings', 'judged by', 'rollouts', 'AUROC', 'failures called a success', 'no verdict',

@@ -82,8 +82,8 @@ from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.success.estimator import SuccessEstimator, verdict_word
+from mtv_world_ros.success.footage_memory import footage_of
 from mtv_world_ros.success.foreseen import foreseen_ends
-from mtv_world_ros.success.rollout_memory import footage_of
 from mtv_world_ros.success.task import load_task, load_tasks, match_task, object_called, TaskSpec
 from mtv_world_ros.viewing.video import Comparison, contact_sheet
 from mtv_world_ros.vision.held_objects import Hold, judge_stops, Stop, tools_in_views

@@ -175,7 +175,7 @@ def _read_calibration(folder: Path) -> Any:
 def make_ranking(folder: Path) -> None:
     """One result of a ranking."""
     from mtv_world_ros.core.files import write_json
-    from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate
+    from mtv_world_ros.ranking.jobs import Result, StoredEstimate
     from mtv_world_ros.ranking.run_jobs import FOLDER
 
     judged = StoredEstimate(

@@ -32,7 +32,8 @@ def test_the_file_has_a_row_for_all_that_can_be_set_and_for_nothing_else(kind, s
     )
     assert not gone, (
         f'{kind} {gone} are gone, but have rows. If somebody may miss one, add it to '
-        f'REMOVED_OPTIONS of cli/commands.py, REMOVED of ros/parameters.py or `removed` of its '
+        f'REMOVED_OPTIONS of cli/commands.py, REMOVED of ros/parameters.py, REPLACED of its '
+        f'launch file or `removed` of its '
         f'schema, with what to use now; then {_RECORD}'
     )
 

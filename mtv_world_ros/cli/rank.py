@@ -28,8 +28,8 @@ from mtv_world_ros.core.errors import ConfigError, PolicyError
 if TYPE_CHECKING:
     from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.model.checkpoint import Checkpoint
+    from mtv_world_ros.ranking.jobs import Job
     from mtv_world_ros.ranking.policy_list import ListedPolicy
-    from mtv_world_ros.ranking.rollout_jobs import Job
     from mtv_world_ros.ranking.run_jobs import RankedCheckpoint
     from mtv_world_ros.reports.shown_rankings import LiveRanking
     from mtv_world_ros.robot.model import RobotModel
@@ -140,16 +140,16 @@ def _rank(arguments: argparse.Namespace) -> int:
     listed = _listed(arguments, robot)
     jobs = _jobs(arguments, listed, robot)
     from mtv_world_ros.core.images import write_png
+    from mtv_world_ros.ranking.episode_runner import RunnerConfig
     from mtv_world_ros.ranking.flips import flip_sheet
     from mtv_world_ros.ranking.policy_list import ListedPolicies
     from mtv_world_ros.ranking.ranking_summary import Optimism, Summary
-    from mtv_world_ros.ranking.rollout_runner import RolloutConfig
     from mtv_world_ros.ranking.run_jobs import FOLDER, run_jobs
     from mtv_world_ros.reports.ranking_report import console, write_ranking
 
     folders = [arguments.out, arguments.out / 'compared'][: len(names)]
     checkpoints = [_ranked(arguments, one, out) for one, out in zip(opened, folders, strict=True)]
-    config = RolloutConfig(
+    config = RunnerConfig(
         num_inference_steps=arguments.steps,
         max_chunks=arguments.max_chunks,
         hold=arguments.hold,
@@ -273,14 +273,14 @@ def _fault_set(text: str) -> str:
 def _jobs(
     arguments: argparse.Namespace, listed: Sequence[ListedPolicy], robot: RobotModel
 ) -> list[Job]:
-    from mtv_world_ros.ranking.policy_list import check_tasks, tasks_of
-    from mtv_world_ros.ranking.rollout_jobs import (
+    from mtv_world_ros.ranking.jobs import (
         BENCHMARK_TASKS,
         DEFAULT_POLICIES,
         DEFAULT_TASKS,
         make_jobs,
         policies_named,
     )
+    from mtv_world_ros.ranking.policy_list import check_tasks, tasks_of
     from mtv_world_ros.simulation.expert.expert import Expert
     from mtv_world_ros.simulation.faults.catalogue import policies_of
     from mtv_world_ros.simulation.scenes.tasks import tasks_named

@@ -12,7 +12,7 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import BoolArray, FloatArray, SuccessEstimate
 from mtv_world_ros.core.images import resize_frames
-from mtv_world_ros.ranking.rollout_jobs import COMMANDS_PART, OBJECTS_PART, WorldComparison
+from mtv_world_ros.ranking.jobs import COMMANDS_PART, OBJECTS_PART, WorldComparison
 from mtv_world_ros.rollout.prediction import Prediction
 from mtv_world_ros.rollout.rollout import ObservedChunk
 from mtv_world_ros.simulation.simulated_world import SeenChunk

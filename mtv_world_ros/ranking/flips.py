@@ -10,8 +10,8 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import BoolArray, ByteArray
 from mtv_world_ros.core.images import encode_png
+from mtv_world_ros.ranking.jobs import Result
 from mtv_world_ros.ranking.judges import is_contact
-from mtv_world_ros.ranking.rollout_jobs import Result
 from mtv_world_ros.simulation.collect.contact_sheet import titled_picture
 from mtv_world_ros.simulation.faults.catalogue import EXPERT
 

@@ -20,7 +20,7 @@ from mtv_world_ros.evaluation.metrics.statistics import (
     UNKNOWN,
     wilson,
 )
-from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate
+from mtv_world_ros.ranking.jobs import Result, StoredEstimate
 from mtv_world_ros.simulation.faults.catalogue import FAULTS, parse_variant
 
 

@@ -20,7 +20,7 @@ from scipy.special import betainc, expit
 
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.evaluation.metrics.statistics import Interval, MIN_SCENES, t_quantile, UNKNOWN
-from mtv_world_ros.ranking.rollout_jobs import Result
+from mtv_world_ros.ranking.jobs import Result
 from mtv_world_ros.success.comparison import ComparedPair, Comparison
 
 #: least probability that a policy is better in most scenes that tell, of an ordered pair

@@ -14,6 +14,7 @@ import numpy as np
 from mtv_world_ros.evaluation.metrics.policy_agreement import powered_mean, PoweredMean
 from mtv_world_ros.evaluation.metrics.statistics import mean_interval
 from mtv_world_ros.ranking.flips import find_flips
+from mtv_world_ros.ranking.jobs import Job, Result
 from mtv_world_ros.ranking.judges import (
     agreements,
     false_success,
@@ -28,7 +29,6 @@ from mtv_world_ros.ranking.judges import (
     true_rate,
 )
 from mtv_world_ros.ranking.policy_order import PolicyOrder
-from mtv_world_ros.ranking.rollout_jobs import Job, Result
 from mtv_world_ros.simulation.faults.catalogue import EXPERT, in_order
 
 #: label of all tasks together

@@ -16,8 +16,8 @@ from mtv_world_ros.core.files import plain, write_json, write_whole
 from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.core.workers import IN_PROCESS, Workers
 from mtv_world_ros.evaluation.result_settings import check_same_settings
-from mtv_world_ros.ranking.rollout_jobs import Job, Result
-from mtv_world_ros.ranking.rollout_runner import make_runner, RolloutConfig, WantedJob
+from mtv_world_ros.ranking.episode_runner import make_runner, RunnerConfig, WantedJob
+from mtv_world_ros.ranking.jobs import Job, Result
 from mtv_world_ros.rollout.pipeline import Pipeline
 
 FOLDER = 'rollouts'
@@ -43,7 +43,7 @@ def run_jobs(
     jobs: Sequence[Job],
     checkpoints: Sequence[RankedCheckpoint],
     *,
-    config: RolloutConfig,
+    config: RunnerConfig,
     workers: Workers = IN_PROCESS,
     overwrite: bool = False,
     show_progress: bool = True,
@@ -103,7 +103,7 @@ class _Store:
     def __init__(
         self,
         checkpoint: RankedCheckpoint,
-        config: RolloutConfig,
+        config: RunnerConfig,
         jobs: Sequence[Job],
         overwrite: bool,
     ) -> None:

@@ -32,7 +32,7 @@ from mtv_world_ros.ranking.judges import (
 from mtv_world_ros.ranking.policy_order import MIN_CONFIDENCE, MIN_TELLING, PolicyOrder
 from mtv_world_ros.ranking.ranking_summary import ALL_TASKS, Optimism, Summary
 from mtv_world_ros.reports.charts import Point, scatter_chart
-from mtv_world_ros.reports.rollout_cards import rollout_cards
+from mtv_world_ros.reports.result_cards import result_cards
 from mtv_world_ros.simulation.faults.catalogue import FAULTS
 from mtv_world_ros.success.comparison import RULE as COMPARISON_RULE
 from mtv_world_ros.success.estimator import FAILURE_BELOW, SUCCESS_FROM
@@ -586,7 +586,7 @@ def write_ranking(summary: Summary, out: Path) -> Path:
         tiles=_tiles(summary),
         charts=charts,
         policies=_points(summary, next(iter(REPORTED)), None),
-        rollouts=rollout_cards(summary.results, out),
+        rollouts=result_cards(summary.results, out),
         # videos are separate files next to the page: a thousand videos would not fit into it
         files=" 'self' file:",
     )

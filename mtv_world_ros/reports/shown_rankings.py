@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from mtv_world_ros.ranking.both_worlds import FRAMES
-from mtv_world_ros.ranking.rollout_jobs import Result
+from mtv_world_ros.ranking.jobs import Result
 from mtv_world_ros.ranking.run_jobs import read_results
-from mtv_world_ros.reports.rollout_cards import (
+from mtv_world_ros.reports.result_cards import (
     estimate_text,
-    rollout_file,
+    result_file,
     verdict,
     when_they_part,
     worst_first,
@@ -51,7 +51,7 @@ def last_rollouts(folder: Path, results: Sequence[Result], count: int) -> Iterat
 
 
 def _path(folder: Path, result: Result) -> Path:
-    return rollout_file(folder, result, FRAMES)
+    return result_file(folder, result, FRAMES)
 
 
 def _ranked(folder: Path, result: Result) -> ScoredRollout:

@@ -27,7 +27,7 @@ from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.success.calibration import HorizonCurve
 from mtv_world_ros.success.comparison import Comparison
 from mtv_world_ros.success.estimator import SuccessEstimator
-from mtv_world_ros.success.rollout_memory import RolloutMemory
+from mtv_world_ros.success.footage_memory import FootageMemory
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.vision.camera_check import CameraCheck
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
@@ -49,7 +49,7 @@ class JudgeState:
 
     objects: ObjectForesight
     camera_check: CameraCheck = CameraCheck()
-    memory: RolloutMemory | None = None
+    memory: FootageMemory | None = None
     frame_doubt: str = ''
     observed_doubts: tuple[str, ...] = ()
 

@@ -39,8 +39,8 @@ from mtv_world_ros.success.comparison import Comparison
 from mtv_world_ros.success.doubts import Grounds, widened
 from mtv_world_ros.success.estimator import SuccessEstimator, verdict_word
 from mtv_world_ros.success.fitted_to import Setting
+from mtv_world_ros.success.footage_memory import footage_of, FootageMemory
 from mtv_world_ros.success.own_tasks import bundled_tasks, chosen_task
-from mtv_world_ros.success.rollout_memory import footage_of, RolloutMemory
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.trust import OtherCell, with_notes, without_verdict
 from mtv_world_ros.vision.camera_check import CameraCheck, CameraChecker
@@ -336,7 +336,7 @@ class SuccessJudge:
         foreseen: ForeseenMotions | None = None,
         *,
         is_real: bool = False,
-    ) -> tuple[SuccessEstimate, RolloutMemory]:
+    ) -> tuple[SuccessEstimate, FootageMemory]:
         """Return the estimate after a chunk of 1 + T states, and what it remembers."""
         footage = footage_of(motion, start_masks, masks)
         judged = self.estimator.for_task(options.task).estimate(

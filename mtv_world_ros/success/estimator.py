@@ -30,6 +30,7 @@ from mtv_world_ros.success.evidence import (
     view_mean,
 )
 from mtv_world_ros.success.fitted_to import Setting
+from mtv_world_ros.success.footage_memory import Footage, FootageMemory, remember
 from mtv_world_ros.success.foreseen import (
     foreseen_ends,
     foreseen_feature,
@@ -38,7 +39,6 @@ from mtv_world_ros.success.foreseen import (
     PictureGap,
 )
 from mtv_world_ros.success.relations import Margin
-from mtv_world_ros.success.rollout_memory import Footage, remember, RolloutMemory
 from mtv_world_ros.success.share_fit import ShareEstimate, ShareFit
 from mtv_world_ros.success.situation import grippers_open, grippers_released
 from mtv_world_ros.success.task import load_tasks, match_task, object_called, TaskSpec
@@ -167,7 +167,7 @@ class JudgedChunk(NamedTuple):
     """The estimate after a chunk, and the memory for the next chunk."""
 
     estimate: SuccessEstimate
-    memory: RolloutMemory
+    memory: FootageMemory
 
 
 class SuccessEstimator:
@@ -233,7 +233,7 @@ class SuccessEstimator:
         self,
         footage: Footage,
         instruction: str = '',
-        memory: RolloutMemory | None = None,
+        memory: FootageMemory | None = None,
         foreseen: ForeseenMotions | None = None,
         *,
         is_real: bool = False,
@@ -279,7 +279,7 @@ class SuccessEstimator:
         return JudgedChunk(judged, memory)
 
     def foresee(
-        self, foreseen: ForeseenMotions, instruction: str, memory: RolloutMemory | None = None
+        self, foreseen: ForeseenMotions, instruction: str, memory: FootageMemory | None = None
     ) -> ForeseenEnds | None:
         """Return the outcome of the task at the end of motions; None = not known.
 
@@ -299,7 +299,7 @@ class SuccessEstimator:
         self,
         foreseen: ForeseenMotions,
         instruction: str,
-        memory: RolloutMemory | None,
+        memory: FootageMemory | None,
         cameras: Sequence[CameraModel],
         *,
         knows_grippers: bool = True,

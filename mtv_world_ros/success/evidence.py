@@ -17,6 +17,7 @@ from mtv_world_ros.cameras.mask_geometry import (
 )
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import CannotTell
+from mtv_world_ros.success.footage_memory import MOVED_M, ObservedGrasp
 from mtv_world_ros.success.relations import (
     Inside,
     Margin,
@@ -24,7 +25,6 @@ from mtv_world_ros.success.relations import (
     ServedOn,
     Within,
 )
-from mtv_world_ros.success.rollout_memory import MOVED_M, ObservedGrasp
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.success.views import Views
 from mtv_world_ros.vision.jaccard import mean_of_known

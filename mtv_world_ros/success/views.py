@@ -9,7 +9,7 @@ import numpy as np
 from mtv_world_ros.cameras.mask_geometry import centroids, locate, Location, moved_mask
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import CannotTell
-from mtv_world_ros.success.rollout_memory import Footage, RolloutMemory
+from mtv_world_ros.success.footage_memory import Footage, FootageMemory
 from mtv_world_ros.vision.jaccard import jaccard
 
 #: number of frames at the end whose median is used
@@ -36,7 +36,7 @@ class Views:
     """
 
     footage: Footage
-    memory: RolloutMemory
+    memory: FootageMemory
     used: tuple[str, ...]
 
     @property

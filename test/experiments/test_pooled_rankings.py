@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 
 from mtv_world_ros.core.errors import ConfigError
-from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate
+from mtv_world_ros.ranking.jobs import Result, StoredEstimate
 
 ROOT = Path(__file__).resolve().parents[2]
 UNKNOWN = StoredEstimate.stated(nan, 'abstains')

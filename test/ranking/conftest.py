@@ -9,8 +9,8 @@ from mtv_world_ros.control.trajectory_video import TrajectoryVideo, TrajectoryVi
 from mtv_world_ros.core.data_types import WorldModelSpec
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.images import resize_frames
-from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate
-from mtv_world_ros.ranking.rollout_runner import RolloutConfig, RolloutRunner
+from mtv_world_ros.ranking.episode_runner import EpisodeRunner, RunnerConfig
+from mtv_world_ros.ranking.jobs import Result, StoredEstimate
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.simulation.expert.expert import Expert
@@ -68,7 +68,7 @@ def runner(robot, expert):
         world_model.begin(seed, task)
         return scripted_policy(name, task, seed, expert)
 
-    return RolloutRunner(pipeline, RolloutConfig(max_chunks=4, make_policy=make_policy))
+    return EpisodeRunner(pipeline, RunnerConfig(max_chunks=4, make_policy=make_policy))
 
 
 @pytest.fixture

@@ -12,12 +12,12 @@ from mtv_world_ros.ranking.both_worlds import (
     object_overlaps,
     verdicts_part,
 )
+from mtv_world_ros.ranking.episode_runner import ComparisonRunner
+from mtv_world_ros.ranking.jobs import make_jobs, Result, WorldComparison
 from mtv_world_ros.ranking.ranking_summary import Summary
-from mtv_world_ros.ranking.rollout_jobs import make_jobs, Result, WorldComparison
-from mtv_world_ros.ranking.rollout_runner import ComparisonRunner
 from mtv_world_ros.ranking.run_jobs import RankedCheckpoint, read_results, run_jobs
 from mtv_world_ros.reports.ranking_report import write_ranking
-from mtv_world_ros.reports.rollout_cards import curves, verdict, when_they_part, worst_first
+from mtv_world_ros.reports.result_cards import curves, verdict, when_they_part, worst_first
 from mtv_world_ros.simulation.scenes.tasks import tasks_named
 from mtv_world_ros.success.estimator import verdict_word
 from mtv_world_ros.viewing.stored_rollout import load_rollout

@@ -3,7 +3,7 @@ import pickle
 import pytest
 
 from mtv_world_ros.core.errors import ConfigError, PolicyError
-from mtv_world_ros.ranking.rollout_jobs import DEFAULT_POLICIES, make_jobs, policies_named
+from mtv_world_ros.ranking.jobs import DEFAULT_POLICIES, make_jobs, policies_named
 from mtv_world_ros.simulation.scenes.tasks import task_named, tasks_named
 from test.support.own_task import write_shift_right
 

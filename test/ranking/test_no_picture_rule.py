@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from mtv_world_ros.ranking.jobs import make_jobs
 from mtv_world_ros.ranking.no_picture_rule import Thing
-from mtv_world_ros.ranking.rollout_jobs import make_jobs
 from mtv_world_ros.simulation.scenes.tasks import tasks_named
 
 

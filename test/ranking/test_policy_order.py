@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.data_types import FutureEvidence, SuccessEstimate
+from mtv_world_ros.ranking.jobs import Result, StoredEstimate, StoredFutures
 from mtv_world_ros.ranking.policy_order import bradley_terry, PolicyOrder
 from mtv_world_ros.ranking.ranking_summary import Summary
-from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate, StoredFutures
 from mtv_world_ros.reports.ranking_report import (
     best_policy,
     console,

@@ -6,14 +6,14 @@ import pytest
 
 from mtv_world_ros.core.data_types import JointTrajectory
 from mtv_world_ros.core.errors import ConfigError, PolicyError, TrajectoryError
-from mtv_world_ros.ranking.rollout_jobs import make_jobs
-from mtv_world_ros.ranking.rollout_runner import (
+from mtv_world_ros.ranking.episode_runner import (
     ComparisonRunner,
+    EpisodeRunner,
     Results,
-    RolloutConfig,
-    RolloutRunner,
+    RunnerConfig,
     WantedJob,
 )
+from mtv_world_ros.ranking.jobs import make_jobs
 from mtv_world_ros.ranking.run_jobs import RankedCheckpoint, run_jobs
 from mtv_world_ros.simulation.scenes.tasks import tasks_named
 from mtv_world_ros.vision.describers.describer import DescribedObject
@@ -69,7 +69,7 @@ def test_a_policy_sees_images_of_one_size_the_first_one_real(runner, expert):
         return made[-1]
 
     made = []
-    watched = RolloutRunner(runner.pipeline, replace(runner.config, make_policy=make_policy))
+    watched = EpisodeRunner(runner.pipeline, replace(runner.config, make_policy=make_policy))
     result = watched.score(job)
     (policy,) = made
     real, imagined = policy.seen
@@ -94,7 +94,7 @@ def test_a_policy_sees_images_of_one_size_the_first_one_real(runner, expert):
 
     beyond = replace(runner.config, make_policy=lambda *place: Beyond(made[0].policy))
     with pytest.raises(TrajectoryError, match='limit'):
-        RolloutRunner(runner.pipeline, beyond).simulate(job)
+        EpisodeRunner(runner.pipeline, beyond).simulate(job)
 
 
 def test_frames_come_with_joints_as_measured_and_as_commanded(runner, expert):
@@ -117,7 +117,7 @@ def test_a_describer_is_asked_once_about_the_simulator_s_first_frame(runner, exp
             return tuple(DescribedObject(id=colour, name=f'{colour} block') for colour in COLOURS)
 
     (job,) = make_jobs(('expert-stop-0.3',), tasks_named(TASK), 1, 0, expert)
-    asking = RolloutRunner(replace(runner.pipeline, describer=Describer()), runner.config)
+    asking = EpisodeRunner(replace(runner.pipeline, describer=Describer()), runner.config)
     real = asking.simulate(job)
     result = asking.imagine(job, real)
     np.testing.assert_array_equal(shown, real.world.start.frames[:1])
@@ -181,7 +181,7 @@ def test_results_are_kept_and_not_run_again(expert, tmp_path, monkeypatch, make_
         found, failed = run_jobs(
             jobs,
             checkpoints,
-            config=RolloutConfig(),
+            config=RunnerConfig(),
             overwrite=overwrite,
             show_progress=False,
         )
@@ -222,7 +222,7 @@ def test_results_of_another_definition_of_a_task_are_not_taken_over(
     def run(distance_m, **options):
         path = write_shift_right(tmp_path, distance_m=distance_m)
         jobs = make_jobs(('expert',), tasks_named(str(path)), 1, 0, expert)
-        return run_jobs(jobs, [alone], config=RolloutConfig(), show_progress=False, **options)
+        return run_jobs(jobs, [alone], config=RunnerConfig(), show_progress=False, **options)
 
     run(0.1)
     (file,) = (tmp_path / 'rollouts').glob('*.json')
@@ -247,11 +247,11 @@ def test_a_policy_that_cannot_answer_is_told_and_the_others_go_on(
     )
     jobs = make_jobs(('expert',), tasks_named(TASK), 2, 0, expert)
     alone = RankedCheckpoint(make_pipeline=lambda: None, out=tmp_path, settings={})
-    found, failed = run_jobs(jobs, [alone], config=RolloutConfig(), show_progress=False)
+    found, failed = run_jobs(jobs, [alone], config=RunnerConfig(), show_progress=False)
     assert [result.index for result in found[0]] == [1]
     assert failed == {jobs[0]: 'its server is gone'}
 
 
 def test_wrong_limits_are_refused():
     with pytest.raises(ConfigError, match='--max-chunks'):
-        RolloutConfig(max_chunks=0)
+        RunnerConfig(max_chunks=0)

@@ -5,9 +5,9 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
+from mtv_world_ros.ranking.jobs import Job, Result, StoredEstimate
 from mtv_world_ros.ranking.judges import judged_by, JUDGES
 from mtv_world_ros.ranking.ranking_summary import Summary
-from mtv_world_ros.ranking.rollout_jobs import Job, Result, StoredEstimate
 from mtv_world_ros.reports.ranking_report import console, markdown, remarks, tables, write_ranking
 
 #: (policy, true outcomes, imagined probabilities) of four episodes

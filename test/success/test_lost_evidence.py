@@ -15,7 +15,7 @@ from mtv_world_ros.physics.foreseen_motions import ForeseenMotions
 from mtv_world_ros.success.calibration import Calibration, load_fit
 from mtv_world_ros.success.doubts import Grounds, widened
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.rollout_memory import Footage
+from mtv_world_ros.success.footage_memory import Footage
 from test.support.drawn_blocks import BLUE, footage, LEFT, masks, NAMES, path, RED, STACK
 
 TASKS = load_tasks(share_path('config', 'tasks'))

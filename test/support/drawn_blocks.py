@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from mtv_world_ros.core.data_types import CameraModel, ObjectMasks
-from mtv_world_ros.success.rollout_memory import Footage
+from mtv_world_ros.success.footage_memory import Footage
 
 HEIGHT, WIDTH, SCALE = 72, 96, 4
 LEFT = 'place the red block to the left of the blue block'

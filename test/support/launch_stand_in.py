@@ -58,16 +58,26 @@ class LaunchStandIn:
             AssertionError: an argument that is given or used is not declared.
         """
         with _modules():
-            variables: dict[str, Any] = {}
-            exec((self._folder / name).read_text(), variables)  # our own file
-            made = variables['generate_launch_description']().words[0]
-            declared = {m.words[0]: m.fields for m in made if m.kind == 'DeclareLaunchArgument'}
+            _, made = self._description(name)
+            declared = _declared(made)
             assert {*given} <= {*declared}, f'{name} has no {sorted({*given} - {*declared})}'
             context: dict[str, str] = {}
             for argument, fields in declared.items():
                 default = _text(fields['default_value'], context)
                 context[argument] = given.get(argument, default)
             return self._started(made, context)
+
+    def arguments(self, name: str) -> list[str]:
+        """Return the arguments that a file takes; those that it refuses are left out."""
+        with _modules():
+            variables, made = self._description(name)
+        return [one for one in _declared(made) if one not in variables.get('REPLACED', ())]
+
+    def _description(self, name: str) -> tuple[dict[str, Any], list[Made]]:
+        """Return the variables of a file and what it describes."""
+        variables: dict[str, Any] = {}
+        exec((self._folder / name).read_text(), variables)  # our own file
+        return variables, variables['generate_launch_description']().words[0]
 
     def _started(self, made: list[Made], context: Mapping[str, str]) -> list[dict[str, Any]]:
         found = []
@@ -82,6 +92,10 @@ class LaunchStandIn:
             elif one.kind == 'Node':
                 found.append(_node(one, context))
         return found
+
+
+def _declared(made: list[Made]) -> dict[str, dict[str, Any]]:
+    return {one.words[0]: one.fields for one in made if one.kind == 'DeclareLaunchArgument'}
 
 
 def _node(made: Made, context: Mapping[str, str]) -> dict[str, Any]:

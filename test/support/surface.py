@@ -18,6 +18,7 @@ from mtv_world_ros.core.bounded_input import Limits, PREFIX
 from mtv_world_ros.policies.kinds import POLICY_KINDS
 from mtv_world_ros.success.relations import KINDS
 from mtv_world_ros.vision.segmenters.registry import SEGMENTERS
+from test.support.launch_stand_in import LaunchStandIn
 from test.support.pages import generator
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,11 +32,13 @@ _VARIABLE = re.compile(
 def live() -> dict[str, list[str]]:
     """Return the names of today's surface by kind, sorted.
 
-    Names are written as `evaluate --steps`, `world_model.device`, `OptimizerConfig.steps`.
+    Names are written as `evaluate --steps`, `world_model.device`, `replay.launch.py rate`,
+    `OptimizerConfig.steps`.
     """
     found = {
         'options': _options(),
         'parameters': _parameters(),
+        'arguments': _arguments(),
         'keys': _keys(),
         'names': [*mtv_world_ros._PLACES],
         'registries': _registries(),
@@ -56,6 +59,12 @@ def _options() -> Iterator[str]:
 def _parameters() -> Iterator[str]:
     for node, settings in generator('parameter_tables').NODES.items():
         yield from (f'{node}.{name}' for name in settings.model_fields)
+
+
+def _arguments() -> Iterator[str]:
+    launch = LaunchStandIn(ROOT / 'launch')
+    for path in (ROOT / 'launch').glob('*.launch.py'):
+        yield from (f'{path.name} {name}' for name in launch.arguments(path.name))
 
 
 def _keys() -> Iterator[str]:

@@ -8,7 +8,7 @@ import pytest
 from mtv_world_ros.cameras.mask_geometry import count_reversals
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.success.estimator import load_tasks, SuccessEstimator
-from mtv_world_ros.success.rollout_memory import MAX_FRAMES, remember
+from mtv_world_ros.success.footage_memory import MAX_FRAMES, remember
 from test.support.drawn_blocks import BLUE, CAMERAS, footage, LEFT, masks, path, POSES, RED, STACK
 
 HOME = np.array([0.25, 0.15, 0.15])

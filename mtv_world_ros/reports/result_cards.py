@@ -1,4 +1,4 @@
-"""Every rollout as a card of the ranking's page: both worlds, when they part, who was right."""
+"""Every result as a card of the ranking's page: both worlds, when they part, who was right."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from markupsafe import escape, Markup
 from mtv_world_ros.core.documents import number
 from mtv_world_ros.core.estimate_words import CANNOT_TELL, state_of
 from mtv_world_ros.ranking.both_worlds import SHEET, VIDEO
-from mtv_world_ros.ranking.rollout_jobs import Result, StoredEstimate, WorldComparison
+from mtv_world_ros.ranking.jobs import Result, StoredEstimate, WorldComparison
 from mtv_world_ros.ranking.run_jobs import FOLDER
 from mtv_world_ros.reports.filters import Filter, filters
 
@@ -25,11 +25,11 @@ _PLOT_WIDTH_PX = 320
 _PLOT_HEIGHT_PX = 64
 
 
-def rollout_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
-    """Return the filters and the cards of all rollouts; see `worst_first`.
+def result_cards(results: Sequence[Result], out: Path) -> dict[str, Any]:
+    """Return the filters and the cards of all results; see `worst_first`.
 
     Args:
-        results: the rollouts of a ranking.
+        results: results of a ranking, a policy on an episode each.
         out: folder of its page; the videos lie below it.
     """
     policy = Filter(key='policy', label='policy', options=_options(r.policy for r in results))
@@ -143,14 +143,14 @@ def when_they_part(course: WorldComparison) -> list[tuple[float, str]]:
     return sorted((time, what) for what, time in whats.items() if isfinite(time))
 
 
-def rollout_file(out: Path, result: Result, suffix: str) -> Path:
+def result_file(out: Path, result: Result, suffix: str) -> Path:
     """Return where a file of a rollout lies in a ranking's folder."""
     return out / FOLDER / f'{result.name}{suffix}'
 
 
 def _address(out: Path, result: Result, suffix: str) -> str:
     """Return the address of a rollout's file from the page; empty = there is none."""
-    path = rollout_file(out, result, suffix)
+    path = result_file(out, result, suffix)
     return f'{FOLDER}/{quote(path.name)}' if path.is_file() else ''
 
 

@@ -1,4 +1,4 @@
-"""The estimator's input of a chunk, and its memory of the rollout from chunk to chunk."""
+"""The estimator's input of a chunk, and its memory of the chunks before, imagined or real."""
 
 from __future__ import annotations
 
@@ -99,11 +99,11 @@ class ObservedGrasp(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RolloutMemory:
-    """Memory of a rollout: V views, O objects, A arms, N frames.
+class FootageMemory:
+    """Memory of an episode's chunks, imagined or real: V views, O objects, A arms, N frames.
 
     Attributes:
-        start_masks: start masks of the rollout's first frame (T = 1).
+        start_masks: start masks of the episode's first frame (T = 1).
         points: (O, N, 3) centres, NaN where fewer than two views know one [m].
         leans: (O, N, 2) x and y of unit vectors along the objects' long axes, NaN where no view
             knows one.
@@ -136,11 +136,11 @@ class RolloutMemory:
         return self.points.shape[1]
 
     def start_point(self, item: int) -> FloatArray:
-        """Return where an object was in the rollout's first frame (3,) [m], NaN = not known."""
+        """Return where an object was in the episode's first frame (3,) [m], NaN = not known."""
         return self.points[item, 0]
 
 
-def remember(memory: RolloutMemory | None, footage: Footage) -> RolloutMemory:
+def remember(memory: FootageMemory | None, footage: Footage) -> FootageMemory:
     """Return the memory after a chunk.
 
     Args:
@@ -155,10 +155,10 @@ def remember(memory: RolloutMemory | None, footage: Footage) -> RolloutMemory:
     return memory
 
 
-def _begin(footage: Footage) -> RolloutMemory:
+def _begin(footage: Footage) -> FootageMemory:
     masks = footage.frame_masks(0)
     points, leans = _points(footage, 0), _leans(footage, 0)
-    memory = RolloutMemory(
+    memory = FootageMemory(
         start_masks=footage.start_masks,
         points=points[:, None],
         leans=leans[:, None],
@@ -176,7 +176,7 @@ def _begin(footage: Footage) -> RolloutMemory:
     return memory
 
 
-def _followed(memory: RolloutMemory, footage: Footage, frame: int) -> RolloutMemory:
+def _followed(memory: FootageMemory, footage: Footage, frame: int) -> FootageMemory:
     """Return the memory after one more frame."""
     if footage.openings is not None and footage.tools is not None and memory.levels is not None:
         for arm, opening in enumerate(footage.openings[:, frame]):
@@ -201,8 +201,8 @@ def _followed(memory: RolloutMemory, footage: Footage, frame: int) -> RolloutMem
 
 
 def _with_gripper(
-    memory: RolloutMemory, footage: Footage, frame: int, arm: int, opening: float
-) -> RolloutMemory:
+    memory: FootageMemory, footage: Footage, frame: int, arm: int, opening: float
+) -> FootageMemory:
     """Return the memory after a gripper's opening in one more frame."""
     assert memory.levels is not None and memory.closed is not None and footage.tools is not None
     levels, closed = memory.levels.copy(), memory.closed.copy()
@@ -218,7 +218,7 @@ def _with_gripper(
     return memory
 
 
-def _grasped(memory: RolloutMemory, footage: Footage, frame: int, arm: int) -> RolloutMemory:
+def _grasped(memory: FootageMemory, footage: Footage, frame: int, arm: int) -> FootageMemory:
     assert footage.tools is not None
     tool, now = footage.tools[arm, frame], memory.points[:, -1]
     # an object that is clearly elsewhere was moved, however much of it is hidden since
@@ -238,7 +238,7 @@ def _grasped(memory: RolloutMemory, footage: Footage, frame: int, arm: int) -> R
     return replace(memory, grasps=(*memory.grasps, grasp)[-MAX_GRASPS:])
 
 
-def _released(memory: RolloutMemory, arm: int, tool: FloatArray) -> RolloutMemory:
+def _released(memory: FootageMemory, arm: int, tool: FloatArray) -> FootageMemory:
     """End all open grasps of the arm; a gripper that closes in steps has several."""
     ended = tuple(
         grasp._replace(released_at=tool)

@@ -18,8 +18,8 @@ from mtv_world_ros.data.episode import NOMINAL
 from mtv_world_ros.policies.policy import Policy
 from mtv_world_ros.ranking.both_worlds import BothWorlds
 from mtv_world_ros.ranking.flips import last_frames_png, OBJECTS, objects_png
+from mtv_world_ros.ranking.jobs import Job, Result, StoredEstimate, StoredFutures
 from mtv_world_ros.ranking.no_picture_rule import judge_without_pictures
-from mtv_world_ros.ranking.rollout_jobs import Job, Result, StoredEstimate, StoredFutures
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.rollout import Rollout
@@ -36,15 +36,15 @@ MakePolicy = Callable[[str, Task, int, Expert], Policy]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RolloutConfig:
-    """Settings of a ranking's rollouts.
+class RunnerConfig:
+    """Settings of a ranking's episodes.
 
     Attributes:
         num_inference_steps: denoising steps a chunk; 0 = those the model is made for.
         max_chunks: answers of the policy at most.
         hold: number of consecutive answers after which an episode ends if the task is done, or the
             estimate abstains; 0 = the episode continues.
-        clips: keep each rollout as a video, a contact sheet and frames; takes as long as
+        clips: keep each episode as a video, a contact sheet and frames; takes as long as
             imagining it.
         physics: physics of the simulator, a key of `config/physics.yaml`.
         make_policy: function that returns the policy of an episode.
@@ -67,7 +67,7 @@ class RolloutConfig:
             )
 
 
-class RolloutRunner:
+class EpisodeRunner:
     """Runs jobs one after the other in one process.
 
     Args:
@@ -75,7 +75,7 @@ class RolloutRunner:
         config: denoising steps, limits and physics of the episodes.
     """
 
-    def __init__(self, pipeline: Pipeline, config: RolloutConfig) -> None:
+    def __init__(self, pipeline: Pipeline, config: RunnerConfig) -> None:
         self.pipeline, self.config = pipeline, config
         self._expert = Expert(pipeline.robot, physics=config.physics)
         self._sim = SimEpisode(pipeline.robot, self._expert.home, physics=config.physics)
@@ -89,7 +89,7 @@ class RolloutRunner:
         """
         return self.imagine(job, self.simulate(job))
 
-    def simulate(self, job: Job) -> SimulatedRollout:
+    def simulate(self, job: Job) -> SimulatedEpisode:
         """Return the rollout of a policy in the simulator."""
         task = job.load_task()
         policy = self.config.make_policy(job.policy, task, job.seed, self._expert)
@@ -97,7 +97,7 @@ class RolloutRunner:
         world = SimulatedWorld(self._sim, task, fps=spec.fps, chunk_s=spec.chunk_seconds)
         run = self._run(policy, world, job)
         ever, final = world.outcome()
-        return SimulatedRollout(
+        return SimulatedEpisode(
             policy=policy,
             world=world,
             task=task.definition if job.task_definition else None,
@@ -107,7 +107,7 @@ class RolloutRunner:
             final=final,
         )
 
-    def imagine(self, job: Job, real: SimulatedRollout) -> Result:
+    def imagine(self, job: Job, real: SimulatedEpisode) -> Result:
         """Return the result of a policy whose rollout was simulated already."""
         world = real.world
         begun = time.perf_counter()
@@ -164,7 +164,7 @@ class RolloutRunner:
         )
 
     def _pictures_alone(
-        self, job: Job, real: SimulatedRollout, objects: tuple[str, ...]
+        self, job: Job, real: SimulatedEpisode, objects: tuple[str, ...]
     ) -> SuccessEstimate | None:
         """Return the estimate of an episode in which no motion is foreseen.
 
@@ -178,7 +178,7 @@ class RolloutRunner:
         return world.success
 
     def _judge_without_pictures(
-        self, job: Job, real: SimulatedRollout, objects: tuple[str, ...]
+        self, job: Job, real: SimulatedEpisode, objects: tuple[str, ...]
     ) -> StoredEstimate:
         """Return the verdict of the no-picture rule."""
         world, episode = real.world, self._begin(real, job, objects)
@@ -189,12 +189,12 @@ class RolloutRunner:
             return StoredEstimate.stated(nan, cannot_tell(reason))
         return StoredEstimate.stated(float(success), 'the no-picture rule')
 
-    def _begin(self, real: SimulatedRollout, job: Job, objects: tuple[str, ...] = ()) -> Rollout:
+    def _begin(self, real: SimulatedEpisode, job: Job, objects: tuple[str, ...] = ()) -> Rollout:
         """Return an episode that begins with the simulator's first observation."""
         return self.pipeline.begin(real.world.start, self._options(real, job, objects))
 
     def _options(
-        self, real: SimulatedRollout, job: Job, objects: tuple[str, ...]
+        self, real: SimulatedEpisode, job: Job, objects: tuple[str, ...]
     ) -> RolloutOptions:
         """Return the options of the rollouts that begin with the simulator's first observation."""
         return RolloutOptions(
@@ -216,8 +216,8 @@ class RolloutRunner:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SimulatedRollout:
-    """A rollout in the simulator.
+class SimulatedEpisode:
+    """An episode in the simulator.
 
     Attributes:
         policy: the policy that acted.
@@ -256,7 +256,7 @@ class ComparisonRunner:
         runners: runners of the checkpoints, one each; their models have the same frame rate.
     """
 
-    def __init__(self, runners: Sequence[RolloutRunner]) -> None:
+    def __init__(self, runners: Sequence[EpisodeRunner]) -> None:
         self._runners = runners
         rates = {runner.pipeline.spec.fps for runner in runners}
         if len(rates) > 1:
@@ -290,7 +290,7 @@ def _objects_shown(masks: ObjectMasks) -> str:
 
 
 def make_runner(
-    make_pipelines: Sequence[Callable[[], Pipeline]], config: RolloutConfig
+    make_pipelines: Sequence[Callable[[], Pipeline]], config: RunnerConfig
 ) -> ComparisonRunner:
     """Return a runner; picklable with `functools.partial`."""
-    return ComparisonRunner([RolloutRunner(make(), config) for make in make_pipelines])
+    return ComparisonRunner([EpisodeRunner(make(), config) for make in make_pipelines])
