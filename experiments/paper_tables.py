@@ -55,7 +55,7 @@ from mtv_world_ros.core.bounded_input import read_json
 from mtv_world_ros.core.documents import DASH, Table
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.files import share_path, whole_folder, write_json, write_whole
-from mtv_world_ros.data.splits import CARD_FILE, EVERY, select
+from mtv_world_ros.data.splits import CARD_FILE, EVERY, select, spread
 from mtv_world_ros.evaluation.evaluation_summary import (
     EvaluationSummary,
     Group,
@@ -69,7 +69,6 @@ from mtv_world_ros.model.runtime import check_device
 from mtv_world_ros.reports.read_back import read_evaluations
 from mtv_world_ros.success.task import load_tasks
 from mtv_world_ros.training.training_config import load_training_config, TrainingConfig
-from mtv_world_ros.training.training_run import spread
 
 ROOT = Path(__file__).resolve().parents[1]
 #: views of the simulated episodes: the paper's View 1 and View 2

@@ -29,7 +29,7 @@ from page import in_turns, parse_arguments, publish, ratio, table
 import torch
 
 from mtv_world_ros.cli.train import set_overrides
-from mtv_world_ros.data.splits import select
+from mtv_world_ros.data.splits import select, spread
 from mtv_world_ros.model.runtime import choose_dtype, place
 from mtv_world_ros.model.transformer.transformer import MultiViewWanTransformer
 from mtv_world_ros.robot.file import load_robot, robot_path
@@ -38,7 +38,7 @@ from mtv_world_ros.training.dry_run import ideal_seconds, measured_peak
 from mtv_world_ros.training.objective import NoiseDraws
 from mtv_world_ros.training.trainer import batch_loss, Trainer
 from mtv_world_ros.training.training_config import load_training_config
-from mtv_world_ros.training.training_run import load_episodes, spread
+from mtv_world_ros.training.training_run import load_episodes
 from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
 _WARM_UP = 2

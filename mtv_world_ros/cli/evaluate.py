@@ -18,6 +18,7 @@ from mtv_world_ros.cli.shared_options import (
     open_checkpoints,
     pipeline_choices,
     provenance,
+    refuse_for,
     workers_of,
 )
 from mtv_world_ros.core.errors import ConfigError
@@ -172,6 +173,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.success.own_tasks import named_here
 
     arguments.task = named_here(arguments.task, selection.paths)
+    for checkpoint in checkpoints:
+        refuse_for(checkpoint, selection.paths, arguments)
     print(f'{arguments.dataset}: {selection}; physics: {truth}')
     alone = len(entries) == 1
     folders = [arguments.out if alone else arguments.out / _slug(e.label) for e in entries]

@@ -23,6 +23,7 @@ from mtv_world_ros.cli.shared_options import (
     open_checkpoints,
     pipeline_choices,
     pipeline_of,
+    refuse_for,
     watch_arguments,
     workers_of,
 )
@@ -81,6 +82,7 @@ def _replay(arguments: argparse.Namespace) -> int:
 
     (arguments.checkpoint,) = open_checkpoints(arguments.device, arguments.checkpoint)
     arguments.task = named_here(arguments.task, [arguments.episode])
+    refuse_for(arguments.checkpoint, [arguments.episode], arguments)
     out = arguments.out or _default_out(arguments)
     assert out is not None
     check_free(out, arguments.overwrite)
@@ -244,6 +246,8 @@ def _in_world_model(
     for bag in sorted(arguments.out.glob('episode_*')):
         check_free(bag, arguments.overwrite)
     arguments.task = named_here(arguments.task, episodes)
+    if episodes:
+        refuse_for(arguments.checkpoint, episodes, arguments)
     options = EpisodeOptions(
         policy=arguments.policy,
         count=arguments.count or len(episodes) or 1,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
@@ -368,6 +368,34 @@ def open_checkpoints(device: str, *names: str) -> list[Checkpoint]:
 
         check_device(device)
     return opened
+
+
+def refuse_for(
+    checkpoint: Checkpoint, episodes: Sequence[Path], arguments: argparse.Namespace
+) -> None:
+    """Refuse episodes none of which has the views and the robot of a checkpoint.
+
+    Args:
+        checkpoint: checkpoint that is to imagine them.
+        episodes: folders of the episodes.
+        arguments: options of the command, such as `robot` and `topics`.
+
+    Raises:
+        CheckpointError: `--robot` names another robot than the checkpoint's.
+        EpisodeError: none can be used.
+    """
+    from mtv_world_ros.data.bag_mapping import load_source
+    from mtv_world_ros.data.unusable import refuse_unusable
+
+    mapping = load_source(getattr(arguments, 'topics', None), None).mapping
+    robot = checkpoint.load_robot(arguments.robot)
+    refuse_unusable(
+        episodes,
+        checkpoint.spec.views,
+        robot,
+        mapping=mapping,
+        remedy=f"a checkpoint of that robot ('{checkpoint}' is of '{robot.name}')",
+    )
 
 
 def pipeline_choices(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -143,7 +143,9 @@ def add(commands: Commands) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
+    from mtv_world_ros.data.bag_mapping import load_source
     from mtv_world_ros.data.splits import select
+    from mtv_world_ros.data.unusable import refuse_unusable
     from mtv_world_ros.training.training_config import load_training_config, TrainingRun
 
     config = load_training_config(arguments.preset, _overrides(arguments))
@@ -157,7 +159,7 @@ def _train(arguments: argparse.Namespace) -> int:
             'mtv-world train DATASET --out DIR; without them only --dry-run works'
         )
     from mtv_world_ros.model.checkpoint import Checkpoint
-    from mtv_world_ros.robot.file import robot_path
+    from mtv_world_ros.robot.file import load_robot, robot_path
     from mtv_world_ros.rollout.assembly import asked_describer
     from mtv_world_ros.vision.segmenters.choose import choose_segmenter
 
@@ -166,16 +168,24 @@ def _train(arguments: argparse.Namespace) -> int:
         if dataset is not None and not dataset.is_dir():
             select(dataset)  # says that it holds no episodes
     initial = Checkpoint.open(arguments.init) if arguments.init else None
+    source = load_source(arguments.topics, arguments.calibration)
+    paths = select(arguments.dataset, arguments.split, default='train').paths
+    robot = load_robot(robot_path(config.video.robot))
+    refuse_unusable(
+        paths,
+        config.video.views,
+        robot,
+        fps=config.video.fps,
+        mapping=source.mapping,
+        remedy='--set video.robot=FILE (of imported episodes: robot/robot.yaml beside them)',
+    )
+    held_out = _held_out_paths(arguments, paths) if arguments.sample_every else ()
     from mtv_world_ros.model.runtime import check_device, choose_dtype
 
     check_device(arguments.device)
-    from mtv_world_ros.data.bag_mapping import load_source
-    from mtv_world_ros.robot.file import load_robot
     from mtv_world_ros.training.training_run import train
 
-    source = load_source(arguments.topics, arguments.calibration)
     dtype = choose_dtype(arguments.dtype, arguments.device)
-    paths = select(arguments.dataset, arguments.split, default='train').paths
     _use_threads(arguments)
     same = ('out', 'seed', 'device', 'dtype', 'save_every', 'save_minutes', 'cache')
     same += ('latent_cache', 'data_workers', 'peak_tflops')
@@ -193,10 +203,10 @@ def _train(arguments: argparse.Namespace) -> int:
     )
     folder = train(
         run,
-        robot=load_robot(robot_path(config.video.robot)),
+        robot=robot,
         segmenter=choose_segmenter(arguments.segmenter, device=arguments.device),
         describer=asked_describer(arguments.describer),
-        held_out=_held_out(arguments, paths, dtype, source),
+        held_out=_held_out(arguments, held_out, dtype, source),
     )
     if not is_helper_rank():  # the main process may still be writing the result
         _print_result(arguments, config, folder, paths)
@@ -375,44 +385,41 @@ _SPLITS = ('val', 'test')
 
 
 def _held_out(
-    arguments: argparse.Namespace,
-    trained_on: Sequence[Path],
-    dtype: torch.dtype,
-    source: EpisodeSource,
+    arguments: argparse.Namespace, paths: Sequence[Path], dtype: torch.dtype, source: EpisodeSource
 ) -> HeldOut | None:
-    """Return the scorer of held-out episodes; None if it is off.
-
-    Raises:
-        ConfigError: there are no held-out episodes, or they are trained on.
-    """
+    """Return the scorer of held-out episodes; None if it is off."""
     if not arguments.sample_every:
         return None
-    from mtv_world_ros.training.training_run import HeldOut, spread
+    from mtv_world_ros.training.training_run import HeldOut
 
-    paths = spread(_paths(arguments), NUM_HELD_OUT)
+    return HeldOut(_judge(arguments, paths, dtype, source), arguments.sample_every)
+
+
+def _held_out_paths(arguments: argparse.Namespace, trained_on: Sequence[Path]) -> Sequence[Path]:
+    """Return held-out episodes, spread evenly over the split `val`, else `test`.
+
+    Raises:
+        ConfigError: there are none, or they are trained on.
+    """
+    from mtv_world_ros.data.splits import select, spread
+
+    dataset = arguments.held_out or arguments.dataset
+    found = [select(dataset, default=split) for split in _SPLITS]
+    selection = next((one for one, split in zip(found, _SPLITS, strict=True)
+                      if one.split == split), found[0])  # fmt: skip
+    if selection.split not in _SPLITS and arguments.held_out is None:
+        raise ConfigError(
+            f"--sample-every needs held-out episodes, '{dataset}' has no split val or test; give "
+            '--held-out DIR'
+        )
+    paths = spread(selection.paths, NUM_HELD_OUT)
     both = {path.resolve() for path in paths} & {path.resolve() for path in trained_on}
     if both:
         raise ConfigError(
             f"'{min(both)}' and {len(both) - 1} more would be trained on and held out; give "
             '--held-out another folder, or --split train'
         )
-    return HeldOut(_judge(arguments, paths, dtype, source), arguments.sample_every)
-
-
-def _paths(arguments: argparse.Namespace) -> Sequence[Path]:
-    from mtv_world_ros.data.splits import select
-
-    dataset = arguments.held_out or arguments.dataset
-    for split in _SPLITS:
-        selection = select(dataset, default=split)
-        if selection.split == split:
-            return selection.paths
-    if arguments.held_out is None:
-        raise ConfigError(
-            f"--sample-every needs held-out episodes, '{dataset}' has no split val or test; give "
-            '--held-out DIR'
-        )
-    return selection.paths
+    return paths
 
 
 def _judge(

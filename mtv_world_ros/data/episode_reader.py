@@ -251,9 +251,7 @@ class _EpisodeReader:
     ) -> None:
         self.path, self.robot, self.window = path, robot, window
         self.mapping = mapping or BagMapping()
-        streams = mapping.streams() if mapping else {}
-        asked = {k: t for k, t in streams.items() if views is None or k in (*STREAMS, *views)}
-        named = {**asked, **named}
+        named = {**asked_topics(mapping, views), **named}
         self.bag = BagReader(path)
         self.warnings: list[str] = []
         found = self.bag.topics()
@@ -1221,6 +1219,12 @@ class EpisodeTopics:
         for view in self.views.values():
             names |= {view.image, view.camera_info, *([view.mask] if with_masks else [])}
         return names
+
+
+def asked_topics(mapping: BagMapping | None, views: Sequence[str] | None) -> dict[str, str]:
+    """Return the topics that a mapping names, by view and stream; None = of all views."""
+    streams = mapping.streams() if mapping else {}
+    return {k: t for k, t in streams.items() if views is None or k in (*STREAMS, *views)}
 
 
 def find_topics(

@@ -160,6 +160,16 @@ def select(
     )
 
 
+def spread(paths: Sequence[Path], count: int | None) -> list[Path]:
+    """Return `count` of the paths, spread evenly.
+
+    The first paths by name would all belong to one task.
+    """
+    if count is None or count >= len(paths):
+        return list(paths)
+    return [paths[index * len(paths) // count] for index in range(count)]
+
+
 def of_physics(selection: Selection, physics: str | None = None) -> tuple[Selection, str]:
     """Return the episodes of one physics, and a text with the physics and number of episodes.
 

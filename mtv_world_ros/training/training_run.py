@@ -35,7 +35,13 @@ from mtv_world_ros.data.bag_mapping import EpisodeSource
 from mtv_world_ros.data.episode_reader import read_info
 from mtv_world_ros.data.recording import DEFAULT, Recording
 from mtv_world_ros.data.recordings import clip_starts, described_objects
-from mtv_world_ros.data.splits import find_episodes
+from mtv_world_ros.data.splits import find_episodes, spread
+from mtv_world_ros.data.unusable import (
+    MIN_RATE_RATIO,
+    NUM_NAMED,
+    reason_lines,
+    slow_text,
+)
 from mtv_world_ros.model.card import CAMERAS, CARD, read_card, ROBOT_FOLDER
 from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.runtime import check_device, choose_dtype
@@ -61,16 +67,6 @@ from mtv_world_ros.training.training_config import TrainingConfig, TrainingRun
 from mtv_world_ros.training.unknown_cameras import unknown_camera_lines
 from mtv_world_ros.vision.describers.describer import Describer
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
-
-
-def spread(paths: Sequence[Path], count: int | None) -> list[Path]:
-    """Return `count` of the paths, spread evenly.
-
-    The first paths by name would all belong to one task.
-    """
-    if count is None or count >= len(paths):
-        return list(paths)
-    return [paths[index * len(paths) // count] for index in range(count)]
 
 
 def load_episodes(
@@ -135,8 +131,6 @@ _SAME_PICTURE = 0.02
 _MOST_FROZEN = 0.5
 #: distance outside of the image at which a joint may still show its link [fraction of image size]
 _MARGIN = 0.1
-#: episodes that are named with the reason why they were left out
-_NAMED = 3
 
 
 def check_recording(recording: Recording, robot: RobotModel) -> None:
@@ -376,10 +370,10 @@ def training_notes(
         return found
     others = [e.path.name for e in episodes if e.camera_keys != usual]
     if others:
-        more = ', ...' * (len(others) > _NAMED)
+        more = ', ...' * (len(others) > NUM_NAMED)
         found.append(
             f'episodes of other calibrations than most: {len(others)} '
-            f'({", ".join(others[:_NAMED])}{more}); each is drawn by its own'
+            f'({", ".join(others[:NUM_NAMED])}{more}); each is drawn by its own'
         )
     return found
 
@@ -499,33 +493,12 @@ def check_clips(recording: Recording, spec: WorldModelSpec) -> None:
         return
     periods = np.diff(recording.times)
     rate = 1 / float(np.median(periods)) if len(periods) else 0.0
-    if 0 < rate < 0.7 * spec.fps:
-        raise EpisodeError(
-            f"episode '{recording.path}' has {rate:.3g} frames a second, fewer than the model's "
-            f'{spec.fps:g}: set video.fps to {rate:.3g} or less'
-        )
+    if 0 < rate < MIN_RATE_RATIO * spec.fps:
+        raise EpisodeError(slow_text(recording.path, rate, spec.fps))
     raise EpisodeError(
         f"episode '{recording.path}' is too short, or has too large gaps, for a clip of "
         f'{spec.num_frames} frames at {spec.fps} Hz ({spec.chunk_seconds:.1f} s)'
     )
-
-
-def reason_lines(skipped: Mapping[str, str]) -> list[str]:
-    """Return a line for each reason with the names of its first episodes, the frequent first.
-
-    Args:
-        skipped: reasons by the episode's path.
-    """
-    episodes: dict[str, list[str]] = {}
-    for path, reason in skipped.items():
-        name = Path(path).name
-        said = reason.replace(path, '...').replace(f"'{name}'", "'...'")
-        episodes.setdefault(said, []).append(name)
-    frequent = sorted(episodes.items(), key=lambda item: -len(item[1]))
-    return [
-        f'{len(names)} x {reason} ({", ".join(names[:_NAMED])}{", ..." * (len(names) > _NAMED)})'
-        for reason, names in frequent
-    ]
 
 
 _BEST = 'best.json'

@@ -62,7 +62,8 @@ def add(commands: Commands) -> None:
 
 def _fit(arguments: argparse.Namespace) -> int:
     from mtv_world_ros.core.progress import Progress
-    from mtv_world_ros.data.splits import find_episodes, refuse_test_kinds
+    from mtv_world_ros.data.splits import find_episodes, refuse_test_kinds, spread
+    from mtv_world_ros.data.unusable import refuse_unusable
     from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
     from mtv_world_ros.physics.arms.arms import Arms
     from mtv_world_ros.physics.checkpoint_files import (
@@ -79,7 +80,6 @@ def _fit(arguments: argparse.Namespace) -> int:
     )
     from mtv_world_ros.physics.fitting.response_fit import found_response
     from mtv_world_ros.robot.file import load_robot, robot_path
-    from mtv_world_ros.training.training_run import spread
 
     folder = arguments.checkpoint / OBJECT_MOTION_FOLDER
     check_free(folder / CONTACT_FILE, arguments.overwrite)
@@ -89,6 +89,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     likely = first or first_settings(unfitted)
     likely.replace(num_motions=arguments.motions)  # refused before the work begins
     paths = spread(find_episodes(arguments.dataset), arguments.episodes)
+    refuse_unusable(paths, arguments.views, robot)
     refuse_test_kinds(paths, 'training')
     response = load_response(folder, robot)
     if response is None:

@@ -10,7 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtv_world_ros.cli.evaluate import load_pipelines, say_failed
-from mtv_world_ros.cli.shared_options import add_options, device_here, open_checkpoints, provenance
+from mtv_world_ros.cli.shared_options import (
+    add_options,
+    device_here,
+    open_checkpoints,
+    provenance,
+    refuse_for,
+)
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.files import check_free
 from mtv_world_ros.core.writer_lock import only_writer
@@ -75,6 +81,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     print(f'{arguments.dataset}: {selection}')
     arguments.task = named_here(arguments.task, selection.paths)
     refuse_test_kinds(selection.paths, 'calibration')
+    refuse_for(checkpoint, selection.paths, arguments)
     made = {**provenance(arguments), 'dataset': f'{arguments.dataset}: {selection}'}
     with only_writer(checkpoint.folder, '--checkpoint') if arguments.store else nullcontext():
         return _fit_and_store(arguments, checkpoint, selection, made)

@@ -92,6 +92,8 @@ class BagReader:
         problems: other problems found, one line each.
         metadata: MCAP metadata records by name. Complete after a pass.
         custom_data: `custom_data` of metadata.yaml.
+        listed_topics: message type of every topic that metadata.yaml lists, also of those
+            without messages; empty where it does not list them.
 
     Raises:
         EpisodeError: there is no such bag, or it is stored as something else.
@@ -105,6 +107,7 @@ class BagReader:
         self.problems: list[str] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self.custom_data: dict[str, str] = {}
+        self.listed_topics: dict[str, str] = {}
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._most_bytes = limits().chunk_bytes
@@ -214,6 +217,7 @@ class BagReader:
         if not self.path.is_dir():
             raise EpisodeError(f"there is no episode '{self.path}'")
         information = self._read_information()
+        self.listed_topics = _listed_topics(information)
         custom, paths = (information.get(key) for key in ('custom_data', 'relative_file_paths'))
         if isinstance(custom, Mapping):
             self.custom_data = {str(key): str(text) for key, text in custom.items()}
@@ -482,6 +486,19 @@ def _split(records: bytes) -> Iterator[tuple[int, bytes]]:
             return
         yield opcode, records[position : position + length]
         position += length
+
+
+def _listed_topics(information: Mapping[str, Any]) -> dict[str, str]:
+    """Return the types of the topics in metadata.yaml; empty where they are not known.
+
+    Messages of Foxglove are of another type after they were read.
+    """
+    try:
+        rows = [row['topic_metadata'] for row in information['topics_with_message_count']]
+        found = {str(row['name']): str(row['type']) for row in rows}
+    except (LookupError, TypeError):
+        return {}
+    return {} if any(kind.startswith('foxglove') for kind in found.values()) else found
 
 
 def _decompress(body: bytes, end: int, most: int) -> bytes:
