@@ -14,6 +14,10 @@ from mtv_world_ros.ros.messages.conversions import NANO, to_ns
 
 #: seed of the fake world model at which a chunk takes 0.3 s
 SLOW = 1400
+#: that chunk takes at least this [s]
+SLOW_S = 0.3
+#: by which readings of two clocks, and their rounded text, may differ [s]
+CLOCKS_S = 0.01
 NUM_FRAMES, CHUNK_S, PERIOD_S = 4, 0.8, 0.2
 SUCCESS, JACCARD = '/world_model/success', '/world_model/jaccard'
 PREDICTED, MASK = '/world_model/low/predicted/image_raw', '/world_model/low/mask/image_raw'
@@ -78,48 +82,58 @@ def arrived(client, topic):
 
 
 @in_one_try_of_a_few
-def test_verdict_and_masks_come_before_the_first_half_of_the_plan_is_over(client):
+def test_verdict_and_masks_come_while_the_plan_lies_ahead(client):
     since = len(client.report_values())
     stamp_ns = client.send_scene()
     client.send_trajectory(stamp_ns=stamp_ns, seconds=4 * CHUNK_S)
     client.wait_for_ends(1, since)
-    client.spin_for(0.3)
+    client.wait(lambda: len(arrived(client, PREDICTED)) == 4 * NUM_FRAMES, 'the frames')
+    client.wait(lambda: len(arrived(client, MASK)) == 4 * NUM_FRAMES, 'the masks')
     judged_s = [at_s for at_s, _ in arrived(client, SUCCESS)]
     chunks = [r for r in client.report_values()[since:] if r['state'] == 'chunk']
     assert len(judged_s) == len(chunks) == 4
-    assert judged_s[0] < stamp_ns / NANO + 2 * CHUNK_S
-    for number, (at_s, said) in enumerate(zip(judged_s, chunks, strict=True), start=1):
-        lead_s = stamp_ns / NANO + number * CHUNK_S - at_s
-        assert float(said['lead_s']) == pytest.approx(lead_s, abs=0.1)
-    assert float(chunks[-1]['lead_s']) > 0
-    masks = arrived(client, MASK)
-    assert len(masks) == 4 * NUM_FRAMES
-    assert masks[-1][0] < judged_s[-1] + 0.3  # there are images of the same stamps still to come
+    # a verdict waits neither for other verdicts nor for pictures, which wait for their stamps
+    pictures_s = [at_s for at_s, _ in arrived(client, PREDICTED)]
+    assert judged_s[0] < pictures_s[2 * NUM_FRAMES - 1] and judged_s[-1] < pictures_s[-1]
+    assert judged_s[0] < judged_s[-1] - 2 * SLOW_S
+    assert arrived(client, MASK)[-1][0] < pictures_s[-1]
+    # a lead is what is left at the moment when a chunk is ready: that is after the chunk before
+    # it, by what a chunk takes at least, and before its verdict arrives, however late that is
+    ready_s = [stamp_ns / NANO + n * CHUNK_S - float(r['lead_s']) for n, r in enumerate(chunks, 1)]
+    assert ready_s[0] > stamp_ns / NANO + SLOW_S
+    assert all(np.diff(ready_s) > SLOW_S - CLOCKS_S)
+    assert all(ready < at_s + CLOCKS_S for ready, at_s in zip(ready_s, judged_s, strict=True))
 
 
 @in_one_try_of_a_few
 def test_realtime_images_come_one_period_ahead_of_their_stamps(client):
+    since = len(client.report_values('published'))
     stamp_ns = client.send_scene()
     client.send_trajectory(stamp_ns=stamp_ns, seconds=4 * CHUNK_S)
     client.wait(lambda: len(arrived(client, PREDICTED)) == 4 * NUM_FRAMES, 'the frames')
+    client.wait(lambda: len(client.report_values('published')) == since + 4, 'the reports')
     leads = [to_ns(m.header.stamp) / NANO - at_s for at_s, m in arrived(client, PREDICTED)]
-    assert all(lead_s < PERIOD_S + 0.01 for lead_s in leads)
-    # a chunk of 0.8 s takes 0.3 s: too long for the first frame, the last ones are in time
-    assert np.median(leads[-NUM_FRAMES:]) > PERIOD_S - 0.1
-    client.spin_for(0.2)
-    said = client.report_values('published')[-1]
-    assert float(said['frame_lead_s']) == pytest.approx(np.median(leads[-NUM_FRAMES:]), abs=0.1)
+    assert all(lead_s < PERIOD_S + CLOCKS_S for lead_s in leads)  # however late, none is early
+    # a busy machine makes frames late, but not all of them
+    assert max(leads) > PERIOD_S - 0.05
+    # the node says the lead at which it publishes a chunk's frames, which then take their way
+    for number, said in enumerate(client.report_values('published')[since:]):
+        own = leads[number * NUM_FRAMES : (number + 1) * NUM_FRAMES]
+        assert np.median(own) - CLOCKS_S < float(said['frame_lead_s']) < PERIOD_S + CLOCKS_S
 
 
 @in_one_try_of_a_few
 def test_imagined_frames_of_imagine_mode_come_at_the_models_rate(client):
+    since = len(client.report_values('published'))
     client.imagine(True)
     client.send_scene()
     client.send_trajectory()
-    client.wait(lambda: len(arrived(client, PREDICTED)) == NUM_FRAMES, 'the frames')
+    client.wait(lambda: len(client.report_values('published')) > since, 'the report')
     client.imagine(False)
-    (first_s, _), *_, (last_s, _) = arrived(client, PREDICTED)
-    assert 0.55 <= last_s - first_s <= 0.8  # three times 0.2 s
+    said = client.report_values('published')[-1]
+    between_s = float(said['last_frame_s']) - float(said['first_frame_s'])
+    # three times 0.2 s at least; at half the rate it would be twice that, at any load
+    assert 3 * PERIOD_S - CLOCKS_S < between_s < 5.5 * PERIOD_S
 
 
 @in_one_try_of_a_few
