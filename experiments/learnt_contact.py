@@ -19,7 +19,7 @@ policy is begun in all truths or in none. The two rounds were chosen on another 
 of independent futures, their number being the effective sample size. *Round 2*: one draw is one
 sample, as places and sizes differ, too. So likelihood and success are smoothed over draws of
 similar contact, and the interval goes from the 2.5th to the 97.5th percentile of the weighed
-draws' success rates, because this robot has one of them.
+draws' success rates, because this robot has one of them. At first all draws weigh the same.
 
 A truth is a cell; its scenes are those of all seeds. Its rollouts come in random orders; after
 each number of plans the rest of an order is judged. The policies of a seed meet the same scenes,
@@ -127,6 +127,8 @@ class Learning:
         bandwidths: of the kernel, of the logarithms of friction x stiffness / density of what the
             gripper moves and of table friction; empty = draws count each for itself.
         power: exponent of each plan's likelihood; below 1, as errors of plans of one scene agree.
+        is_flat: the draws count alike at first, over all of their range; else as the prior has it,
+            in which 1 of 40 robots is as slippery as `bold`.
     """
 
     scale_m: float = 0.03
@@ -135,13 +137,17 @@ class Learning:
     none_at_m: float = 0.09
     bandwidths: tuple[float, ...] = ()
     power: float = 1.0
+    is_flat: bool = False
 
     def likelihood(self, away_m: FloatArray | float) -> FloatArray:
         """Return the likelihood of an end at a distance [m]."""
         return np.asarray((1 + (np.asarray(away_m) / self.scale_m) ** 2) ** -self.tail)
 
 
-ROUNDS = {'round 1': Learning(), 'round 2': Learning(bandwidths=(0.5, 1.5), power=0.7)}
+ROUNDS = {
+    'round 1': Learning(),
+    'round 2': Learning(bandwidths=(0.5, 1.5), power=0.7, is_flat=True),
+}
 PRIOR = Prior()
 TRACKED_STD_M = 0.005
 
@@ -444,7 +450,10 @@ class Cell:
     def weights(self, seen: Sequence[int]) -> tuple[FloatArray, float]:
         """Return the weights (K,) of the draws and of none of these after some rollouts."""
         share = self._learning.none_share
-        logs = np.log(np.append((1 - share) * self._draws.weights, share))
+        first = self._draws.weights
+        if self._learning.is_flat:
+            first = np.full(len(first), 1 / len(first))
+        logs = np.log(np.append((1 - share) * first, share))
         told = [n for n in seen if self._lines[n].get('done') is not None]
         logs += np.append(self._logs[told].sum(0), len(told) * self._none)
         found = np.exp(logs - logs.max())
