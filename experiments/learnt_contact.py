@@ -68,6 +68,7 @@ from mtv_world_ros.physics.solid_foresight import SolidForesight
 from mtv_world_ros.robot.resample import resample
 from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
+from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.simulation.collect.episode_jobs import episode_seed
 from mtv_world_ros.simulation.collect.record import carry_out, RecordConfig, Take
 from mtv_world_ros.simulation.scenes.tasks import task_named
@@ -246,6 +247,7 @@ def foreseen(
     pipeline: Pipeline, first: Observation, instruction: str, seed: int, commands: FloatArray
 ) -> Line:
     """Return what K draws foresee of commands (C, J); see `rollout`."""
+    assert isinstance(pipeline.judge, SuccessJudge)
     judging = replace(pipeline.judge, camera_checker=None, checks_place=False, grounds=Grounds())
     whole = replace(pipeline, judge=judging)
     episode = whole.begin(
@@ -348,6 +350,7 @@ class Cells:
         return {'final': take.final, 'real': real.tolist(), **said}
 
     def _check(self, first: Observation) -> CameraCheck:
+        assert isinstance(self._pipeline.judge, SuccessJudge)
         checker = self._pipeline.judge.camera_checker
         return CameraCheck() if checker is None else checker.check(first)
 
@@ -369,7 +372,8 @@ def jobs(options: argparse.Namespace) -> Iterator[Job]:
 
     Policies take turns over scenes, so that all kinds come early.
     """
-    seeds, tasks = list(map(int, options.seeds.split(','))), options.tasks.split(',')
+    seeds = [int(seed) for seed in options.seeds.split(',')]
+    tasks: list[str] = options.tasks.split(',')
     for turn in range(options.plans):
         for number, (seed, task) in enumerate(product(seeds, tasks)):
             policies = policies_of(f'drawn:{seed}', options.size, options.policies)
@@ -525,7 +529,7 @@ def rows_of(lines: Sequence[Line], draws: Draws, learning: Learning) -> dict[tup
         for _ in range(ORDERS):
             order = rng.permutation(len(own))
             for after, tally in tallies.items():
-                weights, none = cell.weights(order[:after])
+                weights, none = cell.weights(order[:after].tolist())
                 held[after].append((none, float(weights.sum() ** 2 / (weights**2).sum())))
                 for number in order[after:]:
                     one = cell.estimate(number, weights, none)

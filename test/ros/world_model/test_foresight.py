@@ -104,37 +104,39 @@ def test_verdicts_come_while_the_plan_lies_ahead(client):
     assert all(ready < at_s + CLOCKS_S for ready, at_s in zip(ready_s, judged_s, strict=True))
 
 
-def test_masks_do_not_wait_for_their_stamps(client):
+def plan_in_time(client):
+    """Send a plan of four chunks and wait for its frames, until the last chunk is in time.
+
+    A busy machine makes chunks so late that no frame has to wait for its stamp: then nothing is
+    told of when frames come.
+    """
     for _ in range(MOST_TRIES):
         begin_again(client)
-        since = len(client.report_values())
+        since = len(client.report_values('published'))
         stamp_ns = client.send_scene()
         client.send_trajectory(stamp_ns=stamp_ns, seconds=4 * CHUNK_S)
         for topic in (PREDICTED, MASK):
             client.wait(lambda t=topic: len(arrived(client, t)) == 4 * NUM_FRAMES, topic)
-        leads = [float(r['lead_s']) for r in client.report_values('chunk')[-4:]]
-        assert len(client.report_values()) > since
-        # the last pictures of the third chunk wait until this lead of the fourth is 1 s
-        if leads[-1] > 2 * CHUNK_S:
-            third_s, _ = arrived(client, PREDICTED)[3 * NUM_FRAMES - 1]
-            assert arrived(client, MASK)[-1][0] < third_s
-            return
-    pytest.skip('chunks were late in all tries: nothing had to wait')
+        client.wait(lambda n=since: len(client.report_values('published')) == n + 4, 'the reports')
+        leads = [to_ns(m.header.stamp) / NANO - at_s for at_s, m in arrived(client, PREDICTED)]
+        assert all(lead_s < PERIOD_S + CLOCKS_S for lead_s in leads)  # however late, none is early
+        if float(client.report_values('chunk')[-1]['lead_s']) > 2 * CHUNK_S:
+            return leads, client.report_values('published')[since:]
+    pytest.skip(f'the last chunk was late in {MOST_TRIES} tries')
 
 
-@in_one_try_of_a_few
+def test_masks_do_not_wait_for_their_stamps(client):
+    plan_in_time(client)
+    # the last pictures of the third chunk go out 1 s before the plan's end
+    third_s, _ = arrived(client, PREDICTED)[3 * NUM_FRAMES - 1]
+    assert arrived(client, MASK)[-1][0] < third_s
+
+
 def test_realtime_images_come_one_period_ahead_of_their_stamps(client):
-    since = len(client.report_values('published'))
-    stamp_ns = client.send_scene()
-    client.send_trajectory(stamp_ns=stamp_ns, seconds=4 * CHUNK_S)
-    client.wait(lambda: len(arrived(client, PREDICTED)) == 4 * NUM_FRAMES, 'the frames')
-    client.wait(lambda: len(client.report_values('published')) == since + 4, 'the reports')
-    leads = [to_ns(m.header.stamp) / NANO - at_s for at_s, m in arrived(client, PREDICTED)]
-    assert all(lead_s < PERIOD_S + CLOCKS_S for lead_s in leads)  # however late, none is early
-    # a busy machine makes frames late, but not all of them
-    assert max(leads) > PERIOD_S - 0.05
+    leads, published = plan_in_time(client)
+    assert max(leads[-NUM_FRAMES:]) > PERIOD_S - 0.05
     # the node says the lead at which it publishes a chunk's frames, which then take their way
-    for number, said in enumerate(client.report_values('published')[since:]):
+    for number, said in enumerate(published):
         own = leads[number * NUM_FRAMES : (number + 1) * NUM_FRAMES]
         assert np.median(own) - CLOCKS_S < float(said['frame_lead_s']) < PERIOD_S + CLOCKS_S
 
@@ -154,25 +156,34 @@ def test_imagined_frames_of_imagine_mode_come_at_the_models_rate(client):
 
 
 @in_one_try_of_a_few
-def test_burst_images_come_with_the_verdict(client):
+def test_burst_images_wait_neither_for_their_stamps_nor_for_the_next_verdict(client):
     client.set(pace='burst')
-    client.send_scene()
-    client.send_trajectory()
-    client.wait(lambda: len(arrived(client, PREDICTED)) == NUM_FRAMES, 'the frames')
-    assert arrived(client, PREDICTED)[-1][0] < arrived(client, SUCCESS)[0][0] + 0.1
+    stamp_ns = client.send_scene()
+    client.send_trajectory(stamp_ns=stamp_ns, seconds=4 * CHUNK_S)
+    client.wait(lambda: len(arrived(client, PREDICTED)) == 4 * NUM_FRAMES, 'the frames')
+    pictures_s = [at_s for at_s, _ in arrived(client, PREDICTED)]
+    judged_s = [at_s for at_s, _ in arrived(client, SUCCESS)]
+    # of a chunk in time the last picture would wait 0.2 s to 1.4 s longer
+    assert all(pictures_s[n * NUM_FRAMES - 1] < judged_s[n] for n in (1, 2, 3))
 
 
 def test_every_plan_at_5_hz_ends_once_and_every_chunk_has_its_verdict(client):
     since = len(client.report_values())
-    for _ in range(12):  # each takes 0.3 s to imagine
+    for number in range(12):  # each takes 0.3 s to imagine, or longer
+        judged = len(client.report_values('chunk'))
         stamp_ns = client.send_scene()
-        client.send_trajectory(stamp_ns=stamp_ns, seconds=1.6)
+        client.send_trajectory(stamp_ns=stamp_ns, seconds=2 * CHUNK_S)
         client.spin_for(PERIOD_S)
+        if number % 3 == 2:  # however slow the machine is, a few have time for a chunk
+            client.wait(lambda n=judged: len(client.report_values('chunk')) > n, 'a verdict')
     client.wait_for_ends(12, since)
     client.spin_for(0.3)
     reports = client.report_values()[since:]
     ends = [r for r in reports if r['state'] in ENDS]
-    assert sorted(Counter(r['rollout'] for r in ends).values()) == [1] * 12
+    assert len(ends) == 12
+    # a plan that overtakes the first images is rejected, and begins no rollout
+    ends = [r for r in ends if r['state'] != 'rejected']
+    assert len({r['rollout'] for r in ends}) == len(ends) >= 10
     verdicts = [r for r in reports if r['state'] == 'chunk']
     assert len(verdicts) >= 4
     assert len(arrived(client, SUCCESS)) == len(arrived(client, JACCARD)) == len(verdicts)
