@@ -4,6 +4,8 @@
     python experiments/real_recordings.py grips EPISODES [--robot ROBOT] [--out FOLDER]
     python experiments/real_recordings.py shares EPISODES [--every 16] [--stop-holds 0.75]
                                 [--contact FOLDER] [--memory off]
+    python experiments/real_recordings.py left-out EPISODES [--every 16] [--task TASK.yaml]
+                                [--out out/real_left_out]
     python experiments/real_recordings.py carried EPISODES --checkpoint CHECKPOINT
     python experiments/real_recordings.py rollouts EPISODES --checkpoint CHECKPOINT [--memory off]
                                 [--foresight off] [--out out/real_rollouts]
@@ -18,7 +20,11 @@ follow, which somebody compares with the frames (--out has pictures of each stop
 simulated episodes it counts the frames in which an object goes along with a tool, and in which all
 are far from it, with the stops among them. `shares` foresees the rest of a recording from later
 and later frames, by the masks of the import, and prints the share of futures in which the task
-succeeds, with and without the memory of what frames before showed; no picture is imagined. `carried` compares where objects are foreseen in each chunk, from the recorded frame that it
+succeeds, with and without the memory of what frames before showed; no picture is imagined.
+`left-out` does so with numbers of contact that are fitted on the other recordings, prints the
+verdict of the futures (the share of futures with its 95 % interval, no calibration and no
+picture), and draws the shares over time of all recordings; run again, it goes on where it
+stopped. `carried` compares where objects are foreseen in each chunk, from the recorded frame that it
 starts from, with their recorded masks and with the first frame held; no picture is imagined.
 `rollouts` imagines recordings whole from their first frame: J of the arm in the first chunk and in
 all, PSNR, and J of moving objects, with and without the memory of the background, and foreseen objects. It writes the
@@ -37,6 +43,8 @@ from pathlib import Path
 import subprocess
 from typing import Any
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from page import table
@@ -68,7 +76,11 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.checkpoint_files import load_contact
 from mtv_world_ros.physics.contact_settings import ContactSettings
-from mtv_world_ros.physics.fitting.contact_fit import first_settings
+from mtv_world_ros.physics.fitting.contact_fit import (
+    first_settings,
+    read_recordings,
+    sample_contact,
+)
 from mtv_world_ros.physics.foreseen_motions import foreseen_of
 from mtv_world_ros.physics.grasp_attempts import foreseen_attempts
 from mtv_world_ros.physics.grips import watch_fingers
@@ -84,6 +96,7 @@ from mtv_world_ros.rollout.success_judge import SuccessJudge
 from mtv_world_ros.success.estimator import SuccessEstimator, verdict_word
 from mtv_world_ros.success.footage_memory import footage_of
 from mtv_world_ros.success.foreseen import foreseen_ends
+from mtv_world_ros.success.share_fit import ShareFit
 from mtv_world_ros.success.task import load_task, load_tasks, match_task, object_called, TaskSpec
 from mtv_world_ros.viewing.video import Comparison, contact_sheet
 from mtv_world_ros.vision.held_objects import Hold, judge_stops, Stop, tools_in_views
@@ -524,25 +537,142 @@ def shares_over_time(arguments: argparse.Namespace) -> None:
     settings = load_contact(arguments.contact) if arguments.contact else None
     if settings is None:
         settings = guessed_contact(robot, arguments.stop_holds)
-    tasks = (
-        *load_tasks(share_path('config', 'tasks', 'any_size')),
-        *map(load_task, arguments.task),
-    )
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for path in list_episodes(folder):
         recording = load_recording(path, spec, robot)
-        matched = match_task(tasks, recording.instruction)
+        matched = match_task(known_tasks(arguments.task), recording.instruction)
         if matched is None or recording.object_ids is None:
             rows.append((path.name, '-', '-', '-', '-', 'no known task'))
             continue
-        masks = masks_from_ids(recording.object_ids, recording.objects, recording.names).masks
-        foresight = SolidForesight(robot, None, settings)
-        for start in range(0, len(recording.times) - 2, arguments.every):
-            row = _foreseen_from(recording, masks, foresight, matched, start, arguments.memory)
-            rows.append((path.name, f'{recording.times[start] - recording.times[0]:.1f}', *row))
+        for row in _shares_of(
+            recording, SolidForesight(robot, None, settings), matched, arguments
+        ):
+            rows.append((path.name, *row))
             print('| ' + ' | '.join(rows[-1]) + ' |', flush=True)
-    head = ('recording', 'from [s]', 'share', 'worth futures', 'kept poses', 'attempts')
-    print(table(head, rows))
+    print(table(SHARE_HEAD, rows))
+
+
+#: columns of shares over time
+SHARE_HEAD = ('recording', 'from [s]', 'share', 'worth futures', 'kept poses', 'attempts')
+
+
+def known_tasks(more: Sequence[Path]) -> tuple[TaskSpec, ...]:
+    """Return the bundled tasks for objects of any size, and more of files."""
+    return (*load_tasks(share_path('config', 'tasks', 'any_size')), *map(load_task, more))
+
+
+def _shares_of(
+    recording: Recording,
+    foresight: SolidForesight,
+    matched: tuple[TaskSpec, Mapping[str, str]],
+    arguments: argparse.Namespace,
+) -> Iterator[tuple[str, ...]]:
+    """Yield start [s], share, number of futures, kept poses and attempts, from later frames."""
+    assert recording.object_ids is not None
+    masks = masks_from_ids(recording.object_ids, recording.objects, recording.names).masks
+    for start in range(0, len(recording.times) - 2, arguments.every):
+        row = _foreseen_from(recording, masks, foresight, matched, start, arguments.memory)
+        yield (f'{recording.times[start] - recording.times[0]:.1f}', *row)
+
+
+def foresee_left_out(arguments: argparse.Namespace) -> None:
+    """Print verdicts of futures with contact fitted on the other recordings; draw the shares."""
+    folder: Path = arguments.episodes
+    out = arguments.out = arguments.out or Path('out/real_left_out')
+    out.mkdir(parents=True, exist_ok=True)
+    width, height = RECORDED_SIZE
+    spec = WorldModelSpec(
+        views=arguments.views, fps=RECORDED_FPS, num_frames=8, width=width, height=height, robot=''
+    )
+    robot = load_robot(folder / 'robot' / 'robot.yaml')
+    fits = fits_left_out(arguments, robot)
+    rows, curves = [], dict[str, list[tuple[float, float]] | None]()
+    for path in list_episodes(folder):
+        recording, curves[path.name] = load_recording(path, spec, robot), None
+        matched = match_task(known_tasks(arguments.task), recording.instruction)
+        if matched is None or path.name not in fits:
+            continue
+        settings = ContactSettings.model_validate(fits[path.name])
+        file = out / f'{path.name}.json'
+        found = json.loads(file.read_text()) if file.exists() else []
+        if not found:
+            foresight = SolidForesight(robot, None, settings)
+            found = list(_shares_of(recording, foresight, matched, arguments))
+            file.write_text(json.dumps(found, indent=1))
+        curve = curves[path.name] = list[tuple[float, float]]()
+        for start, share, worth, _, why in found:
+            row: tuple[str, ...] = (start, '-', '-', '-', 'abstains', why)
+            if share != '-':
+                curve.append((float(start), float(share)))
+                row = (start, share, *_verdict_of(float(share), float(worth), settings))
+            rows.append((path.name, *row))
+            print('| ' + ' | '.join(rows[-1]) + ' |', flush=True)
+    head = ('recording', 'from [s]', 'share', 'probability', 'by the share alone', 'verdict')
+    print(table((*head, 'doubt'), rows))
+    draw_shares(curves, out / 'shares.png')
+
+
+def _verdict_of(
+    share: float, num_futures: float, settings: ContactSettings
+) -> tuple[str, str, str, str]:
+    """Return probability, the verdict of the share, the one that is given, and the doubt."""
+    found = ShareFit().estimate(share, num_futures)
+    word = verdict_word(found.probability, (found.low, found.high))
+    shown = f'{found.probability:.2f} [{found.low:.2f}, {found.high:.2f}]'
+    return shown, word, 'abstains' if settings.doubt else word, settings.doubt
+
+
+def fits_left_out(arguments: argparse.Namespace, robot: RobotModel) -> dict[str, Any]:
+    """Return the contact settings of each recording, fitted on the others; those of a file if any.
+
+    The simulations of one fit serve all: those of the recording that is left out do not count.
+    """
+    file: Path = arguments.out / 'fits.json'
+    if not file.exists():
+        paths = list_episodes(arguments.episodes)
+        given, skipped = read_recordings(paths, robot, arguments.views)
+        for path, reason in skipped.items():
+            print(f'left out: {path}: {reason}')
+        samples, _ = sample_contact(given, Arms(robot, None), report=print)
+        samples.fit(print)
+        fits, used = {}, [path for path in paths if str(path) not in skipped]
+        for number, path in enumerate(used):
+            settings, _ = samples.without(number).fit()
+            print(f'without {path.name}: {settings.doubt or "verdicts may rest on it"}')
+            fits[path.name] = settings.model_dump(mode='json')
+        file.write_text(json.dumps(fits, indent=1))
+    return json.loads(file.read_text())
+
+
+def draw_shares(
+    curves: Mapping[str, Sequence[tuple[float, float]] | None], file: Path, num_columns: int = 5
+) -> None:
+    """Draw the share of futures over the time from which they are foreseen, a panel a recording.
+
+    Args:
+        curves: recording -> start [s] and share; None = it has no known task.
+        file: PNG to write.
+        num_columns: panels in a row.
+    """
+    num_rows = -(-len(curves) // num_columns)
+    figure = Figure(figsize=(2.4 * num_columns, 2.0 * num_rows), layout='constrained')
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(num_rows, num_columns, sharey=True, squeeze=False).ravel()
+    for axes, (name, curve) in zip(panels, curves.items(), strict=False):
+        axes.set(title=name, ylim=(-0.05, 1.05))
+        axes.axhline(0.5, color='0.8', linewidth=1)
+        if curve is None:
+            axes.text(0.5, 0.5, 'no known task', ha='center', va='center', color='0.4',
+                      transform=axes.transAxes)  # fmt: skip
+            axes.set_xticks([])
+        elif curve:
+            axes.plot(*zip(*curve, strict=True), 'o-', markersize=4)
+            axes.set_xlabel('foreseen from [s]')
+    for axes in panels[len(curves) :]:
+        axes.set_axis_off()
+    for axes in panels[::num_columns]:
+        axes.set_ylabel('share of futures')
+    figure.savefig(file, dpi=110)
 
 
 def guessed_contact(robot: RobotModel, stop_holds: float) -> ContactSettings:
@@ -619,7 +749,9 @@ def _foreseen_from(
 def main() -> None:
     """Run one of the measurements."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n', 1)[0])
-    parser.add_argument('what', choices=('verdicts', 'grips', 'shares', 'carried', 'rollouts'))
+    parser.add_argument(
+        'what', choices=('verdicts', 'grips', 'shares', 'left-out', 'carried', 'rollouts')
+    )
     parser.add_argument('episodes', type=Path)
     parser.add_argument(
         '--views', type=lambda text: tuple(text.split(',')), default=('ext1', 'ext2')
@@ -639,12 +771,13 @@ def main() -> None:
     parser.add_argument('--memory', choices=('on', 'off'), default='on')
     parser.add_argument('--foresight', choices=('on', 'off'), default='on')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--out', type=Path, help='of grips: pictures; of rollouts: all')
+    parser.add_argument('--out', type=Path, help='of grips: pictures; of others: all')
     arguments = parser.parse_args()
     {
         'verdicts': judge_recorded,
         'grips': print_grips,
         'shares': shares_over_time,
+        'left-out': foresee_left_out,
         'carried': compare_carried,
         'rollouts': imagine_whole,
     }[arguments.what](arguments)

@@ -18,7 +18,8 @@ class LeakSettings:
     Attributes:
         min_chroma: smallest distance of a colour from its grey [grey levels].
         min_cosine: smallest cosine between the chromas of a pixel and a mark.
-        reach_px: distance from a drawn mark within which its colour is a leak [px].
+        reach_px: distance from a drawn mark within which its colour is a leak, and from a colour
+            of the start frames within which it is the scene's [px].
         max_own: number of pixels of the start frames up to which a colour is not the scene's.
         min_said: number of pixels of a chunk from which a remark is made.
     """
@@ -43,7 +44,7 @@ def find_leaks(
     """Return (V, T, H, W) which pixels of imagined frames have a mark's colour.
 
     Pixels near a drawn mark of that colour, where no object is drawn. A colour that the start
-    frames have belongs to the scene and is no leak.
+    frames have there belongs to the scene and is no leak: what is no object stands still.
 
     Args:
         frames: (V, T, H, W, 3) uint8 RGB imagined.
@@ -61,9 +62,11 @@ def find_leaks(
     fingers = FINGER_COLOURS[1:]  # the other one is white, which has no hue
     for colour in (*(arm_colour(arm, num_arms) for arm in range(num_arms)), *fingers):
         is_own = has_colour(start_frames, colour) & ~covers[:, 0]
-        if is_own.sum() > _SETTINGS.max_own:
-            continue
         near = _dilated(has_colour(marks, colour), kernel)
+        if is_own.sum() > _SETTINGS.max_own:
+            if objects is None:
+                continue
+            near &= ~_dilated(is_own, kernel)[:, None]
         leaks |= has_colour(frames, colour) & near
     return leaks & ~covers[:, 1:]
 

@@ -432,10 +432,34 @@ def fit_contact(
         TrainingError: no recording says where an object went.
         RobotError: see `Arms`.
     """
+    samples, common = sample_contact(recordings, arms, first, workers, report, progress)
+    settings, found = samples.fit(report, place)
+    return settings, [*common, *found]
+
+
+def sample_contact(
+    recordings: Sequence[ContactRecording],
+    arms: Arms,
+    first: ContactSettings | None = None,
+    workers: Workers = IN_PROCESS,
+    report: Callable[[str], None] = lambda line: None,
+    progress: Callable[[Sequence[int]], Iterable[int]] = iter,
+) -> tuple[ContactSamples, list[FittedNumber]]:
+    """Simulate recordings under drawn contact parameters; see `fit_contact` for the arguments.
+
+    Returns:
+        The draws with their likelihoods; table, delay and error of the cameras with intervals.
+
+    Raises:
+        TrainingError: no recording says where an object went.
+        RobotError: see `Arms`.
+    """
     if not any(np.isfinite(recording.displacements).any() for recording in recordings):
         raise TrainingError('no episode says where an object went; contact cannot be fitted')
     if first is None:
-        first = fit_fingers([r.grippers for r in recordings], arms, first_settings(arms))
+        # fingers whose commands are what they measured show no swing
+        commanded = [one.grippers for one in recordings if not one.is_measured]
+        first = fit_fingers(commanded, arms, first_settings(arms))
     table, delay = find_table(recordings), find_delay(recordings, arms)
     cameras = find_cameras(recordings)
     for one in (table, delay, cameras):
@@ -456,60 +480,107 @@ def fit_contact(
     )
     first = settings_of_place(first, recordings, report)
     trials = [_Trial.of(one, first, arms.robot) for one in recordings]
-    stops = [stop for one in recordings for stop in one.stops]
-    holds = find_holds(stops)
     if first.squeeze:
         told = [len(trial.stops) for trial in trials]
-        report(str(holds))
+        report(str(find_holds([stop for one in recordings for stop in one.stops])))
         report(
             f'{sum(told)} of these stops, in {np.count_nonzero(told)} of {len(trials)} '
-            'recordings, are simulated one by one'
+            'recordings, are simulated one by one; the rest of measured motion is not'
         )
     make_run = partial(_TrialRunner, arms, trials, workers.num_threads)
     with started(make_run, workers, len(trials)) as run:
-        factors, likelihoods, weights = _populations(run, len(trials), first, report, progress)
-    logs = factors + np.log([_scales(first)[name] for name in RANGES])
-    known = _conditional(logs, weights).tolist()
-    found = [
-        _finding(name, values, likelihoods, weights, spread)
-        for name, values, spread in zip(RANGES, logs.T, known, strict=True)
-    ]
-    products = logs @ [_HOLD.get(name, 0) for name in RANGES]
-    hold = _finding('hold', products, likelihoods, weights)
-    values = {one.name: one.value for one in found}
-    heavier = values['density'] / first.density
-    stiffer = values['finger_stiffness'] / first.finger_stiffness
-    values |= {
-        'tray_kg': float(np.clip(first.tray_kg * heavier, 1e-3, 100)),
-        'finger_damping': first.finger_damping * stiffer,
-    }
-    spreads = {
-        key: float(np.clip(one.spread, _FIT.min_spread, _FIT.max_spread))
-        for key, one in zip(('grip', 'friction', 'weight', 'force'), found, strict=True)
-    }
-    spread = first.spread.model_copy(update=spreads)
-    for one in (*found, hold):
-        report(str(one))
-    report(hold_line(hold.low, hold.high))
-    deciding = _effective_draws(weights)
-    if deciding < _FIT.min_effective_draws:
-        report(
-            f'{deciding:.1f} draws decide: these numbers are likely together, but their intervals '
-            'are too narrow'
-        )
-    origin = ContactOrigin(
-        by='mtv-world fit contact',
-        recordings=len(recordings),
-        telling=hold.count,
-        place=place,
-        hold=(hold.low, hold.high),
+        logs, likelihoods, others = _populations(run, len(trials), first, report, progress)
+    samples = ContactSamples(
+        first=first,
+        logs=logs,
+        likelihoods=likelihoods,
+        others=others,
+        stops=tuple(one.stops for one in recordings),
     )
-    draws = _joint_draws(first, factors, weights)
-    update = {**values, 'spread': spread, 'fitted': origin, 'draws': draws}
-    # measured fingers show what they hold; slipping was fitted without that, as only slips tell it
-    update['grips_hold'] = first.squeeze > 0
-    update['stop_holds'] = holds.value if stops else 1.0
-    return first.model_copy(update=update), [table, delay, cameras, *found, hold]
+    return samples, [table, delay, cameras]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContactSamples:
+    """Draws of contact parameters, and how likely each makes what E recordings show.
+
+    Attributes:
+        first: settings that the draws are factors of, or replace.
+        logs: (N, P) logarithms of the drawn parameters, in the order of `RANGES`.
+        likelihoods: (N, E) log likelihoods.
+        others: (N,) logarithm of the prior of each draw over the density it was drawn with.
+        stops: stops of fingers of each recording.
+    """
+
+    first: ContactSettings
+    logs: FloatArray
+    likelihoods: FloatArray
+    others: FloatArray
+    stops: tuple[tuple[ObservedStop, ...], ...]
+
+    def without(self, number: int) -> ContactSamples:
+        """Return the samples as if a recording did not exist; nothing is simulated again."""
+        return replace(
+            self,
+            likelihoods=np.delete(self.likelihoods, number, axis=1),
+            stops=self.stops[:number] + self.stops[number + 1 :],
+        )
+
+    def fit(
+        self, report: Callable[[str], None] = lambda line: None, place: str = ''
+    ) -> tuple[ContactSettings, list[FittedNumber]]:
+        """Return the fitted settings, and each parameter with its interval.
+
+        Args:
+            report: takes a line about each number.
+            place: robot cell of the recordings; empty = not stated.
+        """
+        first, likelihoods = self.first, self.likelihoods
+        weights, _ = _weights(likelihoods.sum(-1), self.others)
+        logs = self.logs + np.log([_scales(first)[name] for name in RANGES])
+        known = _conditional(logs, weights).tolist()
+        found = [
+            _finding(name, values, likelihoods, weights, spread)
+            for name, values, spread in zip(RANGES, logs.T, known, strict=True)
+        ]
+        products = logs @ [_HOLD.get(name, 0) for name in RANGES]
+        hold = _finding('hold', products, likelihoods, weights)
+        values = {one.name: one.value for one in found}
+        heavier = values['density'] / first.density
+        stiffer = values['finger_stiffness'] / first.finger_stiffness
+        values |= {
+            'tray_kg': float(np.clip(first.tray_kg * heavier, 1e-3, 100)),
+            'finger_damping': first.finger_damping * stiffer,
+        }
+        spreads = {
+            key: float(np.clip(one.spread, _FIT.min_spread, _FIT.max_spread))
+            for key, one in zip(('grip', 'friction', 'weight', 'force'), found, strict=True)
+        }
+        spread = first.spread.model_copy(update=spreads)
+        for one in (*found, hold):
+            report(str(one))
+        report(hold_line(hold.low, hold.high))
+        deciding = _effective_draws(weights)
+        if deciding < _FIT.min_effective_draws:
+            report(
+                f'{deciding:.1f} draws decide: these numbers are likely together, but their '
+                'intervals are too narrow'
+            )
+        origin = ContactOrigin(
+            by='mtv-world fit contact',
+            recordings=likelihoods.shape[1],
+            telling=hold.count,
+            place=place,
+            hold=(hold.low, hold.high),
+        )
+        draws = _joint_draws(first, self.logs, weights)
+        update = {**values, 'spread': spread, 'fitted': origin, 'draws': draws}
+        # measured fingers show what they hold; slipping was fitted without that, as only slips
+        # tell it
+        update['grips_hold'] = first.squeeze > 0
+        stops = [stop for of_recording in self.stops for stop in of_recording]
+        update['stop_holds'] = find_holds(stops).value if stops else 1.0
+        return first.model_copy(update=update), [*found, hold]
 
 
 def settings_of_place(
@@ -555,7 +626,7 @@ def _populations(
     report: Callable[[str], None],
     progress: Callable[[Sequence[int]], Iterable[int]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Draw (N, P) as logarithms, their log likelihoods (N, E), and weights (N,).
+    """Return draws (N, P), log likelihoods (N, E), log prior over proposal density (N,).
 
     Args:
         run: runs a `_TrialRunner`.
@@ -574,7 +645,7 @@ def _populations(
     )
     draws, likelihoods = np.zeros((0, len(RANGES))), np.zeros((0, num_trials))
     proposals: list[tuple[FloatArray, FloatArray] | None] = [None]
-    weights, steps = np.zeros(0), iter(progress(range(_FIT.num_rounds * num_trials)))
+    others, steps = np.zeros(0), iter(progress(range(_FIT.num_rounds * num_trials)))
     for number in range(_FIT.num_rounds):
         draws = np.concatenate([draws, drawn])
         settings = [_settings(first, one) for one in drawn]
@@ -591,7 +662,8 @@ def _populations(
         ]
         mixture = np.logaddexp.reduce(densities, axis=0) - np.log(len(proposals))
         usual = -(((draws - middle) / PRIOR_LOG_STD) ** 2).sum(-1) / 2
-        weights, counts = _weights(likelihoods.sum(-1), usual - mixture)
+        others = usual - mixture
+        weights, counts = _weights(likelihoods.sum(-1), others)
         mean, wide = weights @ draws, _FIT.proposal_scale**2 * _covariance(draws, weights)
         wide += _FIT.proposal_min_log_std**2 * np.eye(len(mean))
         tempered = '' if counts == 1 else f', {counts:.2g} of the likelihood counted'
@@ -600,7 +672,7 @@ def _populations(
         proposals.append((mean, wide))
         rng = np.random.default_rng((_FIT.seed, number))
         drawn = np.clip(rng.multivariate_normal(mean, wide, _FIT.num_draws), low, high)
-    return draws, likelihoods, weights
+    return draws, likelihoods, others
 
 
 def _weights(likelihoods: FloatArray, others: FloatArray) -> tuple[FloatArray, float]:
@@ -718,7 +790,8 @@ class _Trial:
     """An episode whose objects are foreseen under several settings.
 
     Attributes:
-        solids: solids of the O objects that two views see at first.
+        solids: solids of the O objects that two views see at first; none where stops of fingers
+            are simulated in place of the whole episode.
         positions: (1 + T * n, J) commanded.
         displacements: (1 + T, O, 3) since the first step, as masks show them; NaN = not known [m].
         table_m: height of its table.
@@ -736,14 +809,15 @@ class _Trial:
         cls,
         recording: ContactRecording,
         settings: ContactSettings,
-        robot: RobotModel | None = None,
+        robot: RobotModel,
     ) -> _Trial:
         """Return the trial of a recording on a table as high as the settings say.
 
         Args:
             recording: the recording.
-            settings: settings that say how high the table is.
-            robot: robot whose stops of fingers are simulated one by one; None = none are.
+            settings: settings that say how high the table is, and whether commands are measured
+                positions (`squeeze`).
+            robot: robot of the recording.
         """
         frame, points, table = recording.frame, recording.frame.points(), settings.table_m
         if settings.table_varies and np.isfinite(own := recording.table()):
@@ -755,26 +829,44 @@ class _Trial:
             )
             for item, name in enumerate(recording.names)
         ]  # fmt: skip
-        known = [item for item, solid in enumerate(found) if solid is not None]
+        # measured fingers press as lightly as cameras are off: whatever the settings, what they
+        # hold is lost within seconds, and the rest of a recording says nothing. Its stops do
+        known = {
+            item: solid
+            for item, solid in enumerate(found)
+            if solid is not None and not settings.squeeze
+        }
         return cls(
-            solids=tuple(solid for solid in found if solid is not None),
+            solids=tuple(known.values()),
             positions=recording.positions,
             # one memory layout: sums of a pickled copy, in a worker, round alike
-            displacements=np.ascontiguousarray(recording.displacements[:, known]),
+            displacements=np.ascontiguousarray(recording.displacements[:, list(known)]),
             table_m=table,
-            stops=() if robot is None else _stop_trials(recording, found, robot, table),
+            stops=_stop_trials(recording, found, robot, table) if settings.squeeze else (),
         )
 
     def likelihoods(self, engine: Engine, settings: Sequence[ContactSettings]) -> FloatArray:
         """Return (N,) log likelihoods of where masks show the objects."""
-        still = np.zeros(len(engine.arms.drives.names))
+        # where the cameras see all of it is not known: each draw has a shift of its own
         drawn = np.random.default_rng(_FIT.seed).normal(size=(len(settings), 3))
+        shifts = drawn * np.array([[one.spread.camera_m] for one in settings])
+        found = np.zeros(len(settings))
+        if self.solids:
+            found += self._whole(engine, settings, shifts)
+        for stop in self.stops:
+            found += stop.likelihoods(engine, settings, shifts)
+        return found
+
+    def _whole(
+        self, engine: Engine, settings: Sequence[ContactSettings], shifts: FloatArray
+    ) -> FloatArray:
+        """Return (N,) log likelihoods of where masks show the objects of the whole episode."""
+        still = np.zeros(len(engine.arms.drives.names))
         futures = []
-        for one, draw in zip(settings, drawn, strict=True):
-            # where the cameras see all of it is not known: each draw has a shift of its own
-            shift = one.spread.camera_m * draw * [1, 1, one.table_varies]
-            changed = one.model_copy(update={'table_m': self.table_m + shift[2]})
-            solids = tuple(shifted(solid, shift) for solid in self.solids)
+        for one, shift in zip(settings, shifts, strict=True):
+            seen = shift * [1, 1, one.table_varies]
+            changed = one.model_copy(update={'table_m': self.table_m + seen[2]})
+            solids = tuple(shifted(solid, seen) for solid in self.solids)
             futures.append(
                 Future(settings=changed, solids=solids, zeros=still, delay_s=one.delay_s)
             )
@@ -792,12 +884,7 @@ class _Trial:
         found[list(state.lost)] = -np.log1p(
             (_FIT.lost_distance_m / _FIT.position_scale_m) ** 2
         ) * len(self.solids)
-        shifts = np.stack(
-            [one.spread.camera_m * draw for one, draw in zip(settings, drawn, strict=True)]
-        )
-        for stop in self.stops:
-            found = found + stop.likelihoods(engine, settings, shifts)
-        return found
+        return np.asarray(found, np.float64)
 
 
 def _stop_trials(

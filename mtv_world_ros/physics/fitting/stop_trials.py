@@ -18,6 +18,7 @@ import numpy as np
 
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.core.data_types import BoolArray, FloatArray
+from mtv_world_ros.core.transforms import about_z
 from mtv_world_ros.data.episode import Episode
 from mtv_world_ros.physics.arms.arm_response import PERIOD_S
 from mtv_world_ros.physics.contact_settings import ContactSettings
@@ -47,6 +48,8 @@ class StopTrialSettings:
             settings.
         max_width_ratio: largest narrow side of an object that fits between the fingers [widest
             opening].
+        max_width_change: largest factor between the width of an object by its masks and by the
+            fingers that hold it; beyond it they hold a part of it.
     """
 
     before_s: float = 4.0
@@ -57,6 +60,7 @@ class StopTrialSettings:
     along: float = 0.5
     error_rate: float = 0.1
     max_width_ratio: float = 1.1
+    max_width_change: float = 1.3
 
 
 _SETTINGS = StopTrialSettings()
@@ -196,6 +200,8 @@ class StopTrial:
             return None
         solid = replace(solid, centre=solid.centre + before[known[-1]])
         if stop.is_held:  # cameras may see it beside the fingers; it was between them
+            gaps = robot.finger_gaps(part)[closed - first :, stop.arm]
+            solid = _filling(solid, poses[row], 2 * float(np.median(gaps)))
             solid = replace(solid, centre=_between(solid, poses[row]))
         return cls(
             solid=solid,
@@ -234,6 +240,23 @@ class StopTrial:
         found = np.log(np.where(right, 1 - _SETTINGS.error_rate, _SETTINGS.error_rate))
         found[list(state.lost)] = np.log(0.5)
         return found
+
+
+def _filling(solid: Solid, tool: FloatArray, gap_m: float) -> Solid:
+    """Return a solid as wide as the gap between the fingers of a tool (4, 4) that hold it.
+
+    Masks tell a width to some millimetres, which is as far as fingers press; fingers that stopped
+    measure it.
+    """
+    way = np.abs(about_z(-solid.yaw) @ tool[:3, 1])[:2]
+    widths = solid.size[:2] / np.maximum(way, 1e-6)
+    axis, width = int(widths.argmin()), float(widths.min())
+    ratio = gap_m / width
+    if not 1 / _SETTINGS.max_width_change < ratio < _SETTINGS.max_width_change:
+        return solid
+    size = solid.size.copy()
+    size[:2] *= ratio if solid.is_round else np.where(np.arange(2) == axis, ratio, 1.0)
+    return replace(solid, size=size)
 
 
 def _between(solid: Solid, tool: FloatArray) -> FloatArray:

@@ -59,8 +59,8 @@ def object_displacements(episode: Episode, robot: RobotModel, views: Sequence[st
     Taken from `/object_poses`, or else from the masks.
 
     Raises:
-        EpisodeError: it lacks masks, joint states or commands, or no object is seen by two views
-            in the first frame.
+        EpisodeError: it lacks masks, joint states or commands, a joint of the robot was not
+            measured, or no object is seen by two views in the first frame.
     """
     path, states = episode.info.path, episode.joint_states
     if episode.masks is None or states is None or not episode.trajectories:
@@ -88,8 +88,7 @@ def object_displacements(episode: Episode, robot: RobotModel, views: Sequence[st
 def first_frame(episode: Episode, robot: RobotModel, views: Sequence[str]) -> FirstFrame:
     """Return the first masks of an episode with masks and joint states."""
     assert episode.masks is not None and episode.joint_states is not None
-    columns = [episode.joint_states.joint_names.index(name) for name in robot.joint_names]
-    joints = episode.joint_states.positions[:1, columns]
+    joints = episode.joint_states.positions[:1, _columns(episode.joint_states, robot)]
     numbers = np.arange(len(episode.info.objects))[:, None, None] + 1
     cameras = tuple(episode.cameras[view] for view in views)
     return FirstFrame(
@@ -107,18 +106,37 @@ def fine_commands(
     stamp = int(episode.masks[views[0]].stamps_ns[0])
     count = int(_last_ns(episode, views[0]) / 1e9 / STEP_S + 1e-6)
     times = np.arange(count * COMMANDS_A_STEP + 1, dtype=np.float64) * PERIOD_S
-    columns = [episode.joint_states.joint_names.index(name) for name in robot.joint_names]
-    first = episode.joint_states.positions[0][columns]
+    first = episode.joint_states.positions[0][_columns(episode.joint_states, robot)]
     return times, resample(stitched_commands(episode, robot, stamp), first, times)
 
 
 def recorded_positions(
     states: JointStates, robot: RobotModel, stamps_ns: FloatArray
 ) -> FloatArray:
-    """Return joint positions (T, J) at stamps (T,), in the robot's order [rad or m]."""
-    columns = [states.joint_names.index(name) for name in robot.joint_names]
+    """Return joint positions (T, J) at stamps (T,), in the robot's order [rad or m].
+
+    Raises:
+        EpisodeError: a joint of the robot was not measured.
+    """
+    columns = _columns(states, robot)
     found = [np.interp(stamps_ns, states.stamps_ns, states.positions[:, c]) for c in columns]
     return np.stack(found, axis=-1)
+
+
+def _columns(states: JointStates, robot: RobotModel) -> list[int]:
+    """Return the column of each joint of the robot, in its order.
+
+    Raises:
+        EpisodeError: a joint of the robot was not measured.
+    """
+    missing = [name for name in robot.joint_names if name not in states.joint_names]
+    if missing:
+        raise EpisodeError(
+            f"joint states have no '{', '.join(missing)}' of robot '{robot.name}'; they have "
+            f'{", ".join(states.joint_names)}. Give the robot that was recorded (--robot), or '
+            'import the recording with the missing joints as `constants` in the mapping'
+        )
+    return [states.joint_names.index(name) for name in robot.joint_names]
 
 
 def _masks_at(episode: Episode, views: Sequence[str], stamp_ns: float) -> BoolArray:

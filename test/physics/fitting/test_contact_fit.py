@@ -85,7 +85,7 @@ def test_cameras_that_are_off_are_as_far_off_as_their_rays_pass_each_other(recor
 def test_slippery_fingers_are_unlikely_where_a_block_was_carried(
     recording, robot, response, settings
 ):
-    trial = contact_fit._Trial.of(recording, settings)
+    trial = contact_fit._Trial.of(recording, settings, robot)
     tried = [settings.model_copy(update={'grip_friction': value}) for value in (0.05, 0.8, 1.6)]
     low, middle, high = trial.likelihoods(Engine(Arms(robot, response)), tried)
     assert middle > low + 2 and high > low + 2
@@ -196,7 +196,7 @@ def test_the_table_is_found_where_objects_stand(recording):
     assert found.low < 0.012 < found.high
 
 
-def test_several_tables_and_measured_commands_are_told(recording, settings):
+def test_several_tables_and_measured_commands_are_told(robot, recording, settings):
     def of(*recordings):
         said: list[str] = []
         return contact_fit.settings_of_place(settings, recordings, said.append), said
@@ -211,7 +211,7 @@ def test_several_tables_and_measured_commands_are_told(recording, settings):
     assert changed.table_varies and changed.squeeze == 0
     low, high = map(float, re.findall(r'\d\.\d+', said[0]))
     assert low == pytest.approx(0, abs=2e-3) and high == pytest.approx(0.06, abs=2e-3)
-    assert contact_fit._Trial.of(raised, changed).table_m == pytest.approx(0.06, abs=2e-3)
+    assert contact_fit._Trial.of(raised, changed, robot).table_m == pytest.approx(0.06, abs=2e-3)
     changed, said = of(replace(recording, positions=recording.recorded))
     assert changed.squeeze > 0 and 'measured positions' in said[0]
 
@@ -233,6 +233,62 @@ def test_recordings_that_say_nothing_are_refused(robot, response, recording, tmp
     for nothing in ([], [unseen]):
         with pytest.raises(TrainingError, match='no episode says where an object went'):
             fit_contact(nothing, Arms(robot, response))
+
+
+@pytest.mark.parametrize('left_out', [1, 7])
+def test_joint_states_without_a_gripper_leave_a_recording_out(
+    robot, tmp_path, monkeypatch, left_out
+):
+    read = contact_fit.read_episode
+
+    def without(path, **options):
+        episode = read(path, **options)
+        states = episode.joint_states
+        kept = [column for column in range(len(states.joint_names)) if column not in (6, left_out)]
+        names = tuple(states.joint_names[column] for column in kept)
+        states = replace(states, joint_names=names, positions=states.positions[:, kept])
+        return replace(episode, joint_states=states)
+
+    missing = {robot.joint_names[6], robot.joint_names[left_out]}
+    monkeypatch.setattr(contact_fit, 'read_episode', without)
+    recordings, skipped = read_recordings([DEMO], robot, VIEWS)
+    assert not recordings
+    assert all(name in skipped[str(DEMO)] for name in missing)
+    assert '--robot' in skipped[str(DEMO)]
+
+
+def test_measured_recordings_in_which_nothing_is_ever_held_tell_nothing(
+    robot, response, recording
+):
+    """No stop of fingers, or masks that lose what was held: nothing is simulated."""
+    measured = replace(recording, positions=recording.recorded, stops=())
+    lost = np.full_like(recording.displacements, np.nan)
+    lost[:5] = 0.0  # it leaves the table, and is seen no more
+    lines = []
+    settings, found = fit_contact(
+        [measured, replace(measured, displacements=lost)],
+        Arms(robot, response),
+        report=lines.append,
+    )
+    assert found[-1].name == 'hold' and found[-1].count == 0
+    assert 'not within' in settings.doubt
+    assert any('0 of these stops, in 0 of 2 recordings' in line for line in lines)
+
+
+def test_a_recording_that_is_left_out_tells_nothing(settings):
+    draws = np.log(np.array([[0.1, 1.0, 300.0, 1.0], [2.0, 1.0, 300.0, 1.0]] * 32))
+    likely = np.where(np.arange(64) % 2, 0.0, -9.0)  # rough fingers
+    samples = contact_fit.ContactSamples(
+        first=settings,
+        logs=draws,
+        likelihoods=np.stack([likely, np.zeros(64)], axis=1),
+        others=np.zeros(64),
+        stops=((), ()),
+    )
+    (told, _), (untold, _) = samples.fit(), samples.without(0).fit()
+    assert told.grip_friction == pytest.approx(2.0, rel=0.01)
+    assert untold.grip_friction == pytest.approx(np.sqrt(0.2), rel=0.01)
+    assert untold.fitted is not None and untold.fitted.recordings == 1
 
 
 def test_fingers_begin_as_their_joints_follow(robot, response):

@@ -61,6 +61,17 @@ def test_what_was_held_is_put_between_the_fingers(lift):
     assert trial is not None and trial.solid.centre[1] == pytest.approx(0.03)
 
 
+@pytest.mark.parametrize(('seen_m', 'fitted_m'), [(0.045, 0.05), (0.05, 0.05), (0.1, 0.1)])
+def test_what_was_held_is_as_wide_as_the_gap_of_the_fingers(lift, seen_m, fitted_m):
+    """Fingers stop 25 mm from the tool; of a block twice as wide they hold a part."""
+    solid = replace(BLOCK, size=np.array([0.03, seen_m, 0.04]))
+    trial = trial_of(lift, solid=solid)
+    assert trial is not None and trial.solid.size == pytest.approx([0.03, fitted_m, 0.04])
+    # what was not held may be touched by one finger alone
+    trial = trial_of(lift, replace(STOP, is_held=False), solid)
+    assert trial is not None and trial.solid.size == pytest.approx(solid.size)
+
+
 @pytest.mark.parametrize(
     ('stop', 'solid'),
     [
