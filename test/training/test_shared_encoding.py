@@ -80,7 +80,7 @@ def test_a_disk_that_is_full_in_one_process_is_named_and_the_others_clips_stay(w
     assert status == 1, errors
     assert f"latent cache '{latents}" in errors and 'No space left on device' in errors
     assert 'rank      : 1' in errors.partition('Root Cause')[2], errors
-    assert 'Traceback' not in errors and 'adapter for' not in said
+    assert 'latent_cache.py' not in errors and 'adapter for' not in said
     assert shards(latents) == {'000'}
     check_goes_on(words, out)
 
