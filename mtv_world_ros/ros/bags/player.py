@@ -346,23 +346,45 @@ class Player(Node):
         return topic if self.get_namespace() == '/' else topic.lstrip('/')
 
     def _wait_for_subscribers(self) -> None:
+        """Wait for subscribers, and until the number of connections has not changed for a while.
+
+        Where nodes say in diagnostics that they hear nobody on a topic that is played, it waits
+        for that, too; some never will, as their quality of service does not fit.
+        """
         needed = self._options.wait_for or self._plan_topics()
-        end_s = time.monotonic() + self._options.wait_timeout
-        say_s = time.monotonic() + _SILENT_S
-        while unsubscribed := self._unsubscribed(needed):
-            if time.monotonic() > say_s:
+        since_s = time.monotonic()
+        end_s, say_s = since_s + self._options.wait_timeout, since_s + _SILENT_S
+        heard_s = since_s + _HEARD_S
+        known: list[int] = []
+        while True:
+            now_s, now, awaited = time.monotonic(), self._connections(), self._awaited(needed)
+            if awaited:
+                heard_s = now_s + _HEARD_S
+            if awaited or now != known or (now_s < heard_s and self._is_unheard()):
+                known, since_s = now, now_s
+            if awaited and now_s > say_s:
                 say_s = end_s + 1
                 self.get_logger().info(
-                    f'waiting up to {self._options.wait_timeout:g} s for a subscriber of '
-                    f'{unsubscribed}: start the node (world_model); --no-wait plays anyway'
+                    f'waiting up to {self._options.wait_timeout:g} s for {awaited}: is the node '
+                    '(world_model) started? --no-wait plays anyway'
                 )
-            if time.monotonic() > end_s:
+            if awaited and now_s > end_s:
                 raise ConfigError(
-                    f'nobody subscribes to {unsubscribed} after {self._options.wait_timeout:g} s; '
-                    'is the node running in the same ROS_DOMAIN_ID? (--no-wait plays anyway)'
+                    f'{self._options.wait_timeout:g} s went by without {awaited}; is the node '
+                    'running in the same ROS_DOMAIN_ID? (--no-wait plays anyway)'
                 )
+            if not awaited and (now_s > since_s + _SETTLED_S or now_s > end_s):
+                return
             self._executor.spin_once(timeout_sec=0.05)
-        self._wait_until_settled(end_s)
+
+    def _awaited(self, topics: list[str]) -> str:
+        """Return what has to be there before it plays, as text; empty = all is."""
+        unsubscribed = self._unsubscribed(topics)
+        if unsubscribed:
+            return f'a subscriber of {unsubscribed}'
+        # while a node loads its model it subscribes to plans alone, and would keep the last one
+        lifecycle = self._peers.state(self._reporter).get('lifecycle', 'active')
+        return '' if lifecycle == 'active' else f"an active '{self._reporter}' (it is {lifecycle})"
 
     def _unsubscribed(self, topics: list[str]) -> list[str]:
         """Return topics without a subscriber, by the ROS graph and by other nodes' diagnostics."""
@@ -371,25 +393,15 @@ class Player(Node):
             topics = [topic for topic in topics if topic not in unsubscribed]
             unsubscribed = []  # of several trajectory topics a node may read one
         if self._options.lock_step and not unsubscribed:
-            node = self._reports.rpartition('/')[0]
-            unsubscribed = [] if self._peers.state(node) else [f'/diagnostics of {node}']
+            known = self._peers.state(self._reporter)
+            unsubscribed = [] if known else [f'/diagnostics of {self._reporter}']
         return unsubscribed or self._peers.unconnected(topics)
 
-    def _wait_until_settled(self, end_s: float) -> None:
-        """Wait until the number of connections has not changed for a while.
-
-        Where nodes say in diagnostics that they hear nobody on a topic that is played, it waits
-        for that, too; some never will, as their quality of service does not fit.
-        """
-        known, since_s = self._connections(), time.monotonic()
-        heard_s = min(since_s + _HEARD_S, end_s)
-        topics = [publisher.topic_name for publisher in self._outputs.values()]
-        while time.monotonic() < min(since_s + _SETTLED_S, end_s):
-            self._executor.spin_once(timeout_sec=0.05)
-            now = self._connections()
-            is_unheard = time.monotonic() < heard_s and bool(self._peers.unheard(topics))
-            if now != known or is_unheard:
-                known, since_s = now, time.monotonic()
+    def _is_unheard(self) -> bool:
+        """Return whether nodes do not hear what is played, or have not said whether they do."""
+        if self._is_reported() and not self._peers.state(self._reporter):
+            return True
+        return bool(self._peers.unheard(o.topic_name for o in self._outputs.values()))
 
     def _connections(self) -> list[int]:
         outputs = self._outputs.values()
@@ -535,6 +547,11 @@ class Player(Node):
     def _reports(self) -> str:
         """Full name of the topic of reports."""
         return self.resolve_topic_name(self._options.report_topic)
+
+    @property
+    def _reporter(self) -> str:
+        """Full name of the node that reports."""
+        return self._reports.rpartition('/')[0]
 
     def _end(self, index: int, state: str, reason: str) -> None:
         """Set how a plan ended."""
