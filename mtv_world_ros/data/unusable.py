@@ -12,7 +12,7 @@ from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.bag.reader import BagReader
 from mtv_world_ros.data.bag_mapping import BagMapping
-from mtv_world_ros.data.episode_reader import asked_topics, EpisodeTopics, find_topics
+from mtv_world_ros.data.episode_topics import asked_topics, EpisodeTopics, find_topics
 from mtv_world_ros.robot.model import RobotModel
 
 #: images from which the rate is estimated

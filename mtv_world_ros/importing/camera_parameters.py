@@ -188,7 +188,7 @@ def sized_camera(
     """Return the camera for images of a size; a note says where they were stretched.
 
     Raises:
-        CalibrationError: images lie on their side against those that were calibrated.
+        CalibrationError: images are turned by 90 degrees against the calibrated ones.
     """
     if (camera.width - camera.height) * (size[0] - size[1]) < 0:
         raise CalibrationError(

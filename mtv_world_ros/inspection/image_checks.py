@@ -224,7 +224,13 @@ class TurnedFrames:
 def turned_back(
     track: Track, camera: CameraModel, orientation: Orientation
 ) -> tuple[Track, CameraModel]:
-    """Return a view's frames turned or mirrored back, with the camera of such frames."""
+    """Return the upright frames of a view and the camera that fits them.
+
+    Args:
+        track: frames as they were recorded, turned or mirrored.
+        camera: camera of the recorded frames.
+        orientation: how the recorded frames are turned or mirrored.
+    """
     K = camera.K.copy()
     if orientation.is_mirrored:
         K[0, 2] = camera.width - 1 - K[0, 2]

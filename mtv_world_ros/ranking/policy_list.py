@@ -247,7 +247,7 @@ class ListedPolicies:
 
 
 class GuardedPolicy:
-    """A policy of the user's: whatever goes wrong in it is a `PolicyError` that names it.
+    """A user's policy; any exception in it is raised as a `PolicyError` with its name.
 
     Its server, if it is started here, runs when an episode begins, and is started again after it
     died or did not answer in time.

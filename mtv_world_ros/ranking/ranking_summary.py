@@ -117,7 +117,7 @@ class Summary:
 
     @cached_property
     def tasks(self) -> tuple[str, ...]:
-        """In the order of the jobs."""
+        """Names of the tasks, in the order of the jobs."""
         return tuple(dict.fromkeys(result.task for result in self.results))
 
     @cached_property

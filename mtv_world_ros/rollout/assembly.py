@@ -50,7 +50,7 @@ def assemble_policy(name: str | Path, robot: RobotModel) -> PolicyMaker:
 
 
 def policy_settings(name: str | Path, robot: RobotModel) -> PolicySettings:
-    """Return the settings of the policy of a name, checked; no server is asked.
+    """Return the checked settings of a named policy, without asking its server.
 
     Raises:
         ConfigError, PolicyError: as in `assemble_policy`.

@@ -55,7 +55,7 @@ class ImaginedScene:
 
     @property
     def tools(self) -> FloatArray | None:
-        """See `Situation`; those of the last frame."""
+        """Positions (A, 1, 3) of the tools in the last frame [m]; None = not known."""
         tools = self.views.footage.tools
         return None if tools is None else tools[:, -1:]
 

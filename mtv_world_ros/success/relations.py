@@ -118,8 +118,8 @@ class Beside(Relation):
         target: placeholder of the object it is placed by.
         distance_m: smallest and largest distance of the centres in the plane.
         max_across_m: largest |dy| of the centres.
-        max_rise_m: largest |dz| of the centres. Not required: an object in the air is still held,
-            which the grippers tell where they are known.
+        max_rise_m: largest |dz| of the centres, so that the object is not in the air. That no
+            gripper holds it is checked apart, where grippers are known.
         goal_distance_m: dx at which the goal mask is drawn.
     """
 

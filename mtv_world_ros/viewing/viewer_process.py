@@ -223,7 +223,8 @@ def _wait(process: subprocess.Popen[bytes], host: str, port: int, folder: Path) 
         if time.monotonic() > end_s:
             _end(process)
             raise MtvWorldError(
-                f'the viewer does not listen on port {port} after {_START_TIMEOUT_S:g} s'
+                f'the viewer does not listen on port {port} after {_START_TIMEOUT_S:g} s; see '
+                f"'{folder / 'log'}'"
             )
         time.sleep(_POLL_S)
 

@@ -6,7 +6,8 @@ import pytest
 from mtv_world_ros.core.errors import EpisodeError
 from mtv_world_ros.data.bag import messages
 from mtv_world_ros.data.episode import LazyFrames
-from mtv_world_ros.data.episode_reader import in_order, merge_joint_states
+from mtv_world_ros.data.measured_joints import merge_joint_states
+from mtv_world_ros.data.recorded_streams import in_order
 
 
 def joint_state(stamp_ns: int, **positions: float):

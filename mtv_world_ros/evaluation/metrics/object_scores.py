@@ -126,10 +126,10 @@ COPY_DISTANCE = 0.03
 
 
 def displaced_objects(masks: BoolArray, first: BoolArray) -> BoolArray:
-    """Return (V, O) True where a part of an object appears away from its first mask.
+    """Return (V, O) True for objects that appear away from their first mask in two frames or more.
 
-    A second object that grows elsewhere while the first one stays is motion, too, which
-    `moving_objects` does not see. Frames 1..T of at least two such frames count.
+    A copy that appears elsewhere while the object itself stays counts, too; `moving_objects` does
+    not see it.
 
     Args:
         masks: (V, O, T, H, W) masks in the frames.

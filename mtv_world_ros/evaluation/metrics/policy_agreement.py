@@ -255,7 +255,7 @@ class ScoreOfRates:
             posterior; NaN where there is no interval.
         interval: 95 % interval of the latter, widened to hold `observed`; NaN for fewer than
             `MIN_SCENES` scenes or `MIN_POLICIES` policies, where `observed` is not defined, or
-            where all outcomes are judged as they are.
+            where every verdict is right.
     """
 
     observed: float

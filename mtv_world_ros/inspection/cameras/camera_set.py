@@ -208,12 +208,12 @@ class CameraSet:
         seed: int = 0,
         lens: FloatArray | None = None,
     ) -> CameraState:
-        """Return the state at which tool points are seen where somebody saw them.
+        """Return the state that best explains tool points that were marked in images.
 
         Args:
             number: number of the view.
-            points: points of any of its recordings.
-            seed: seed of the cameras that are tried.
+            points: marked points, of any recording of the view.
+            seed: seed of the first guesses of the camera.
             lens: (3,) lens that is held; None = fx and fy are estimated.
         """
         first, camera = points[0].recording, self._camera(number, points[0])

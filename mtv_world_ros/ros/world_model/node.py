@@ -116,9 +116,9 @@ class WorldModelNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Free the model, whose parts refer to each other, at once."""
+        """Free the memory of the model at once."""
         self._release()
-        gc.collect()
+        gc.collect()  # parts of the model refer to each other
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -110,11 +110,11 @@ class DriveTargets:
     """Set points of the arms in a period of commands, at the steps of the engine.
 
     Attributes:
-        ways: (1 + N, D) positions of drives.
-        velocities: (1 + N, D) velocities of drives.
-        forces: (N, D) forces that move them so in free air.
-        free: (1 + N, D) positions if nothing is touched; fingers swing.
-        fast: (1 + N, D) velocities if nothing is touched.
+        ways: (1 + N, D) commanded positions of the drives [rad or m].
+        velocities: (1 + N, D) commanded velocities of the drives [rad/s or m/s].
+        forces: (N, D) efforts that follow the commands without contact [N m or N].
+        free: (1 + N, D) positions without contact, with the fingers' oscillation [rad or m].
+        fast: (1 + N, D) velocities without contact [rad/s or m/s].
     """
 
     ways: FloatArray

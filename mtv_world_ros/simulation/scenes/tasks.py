@@ -413,7 +413,10 @@ def tasks_named(text: str, folder: Path = Path()) -> tuple[Task, ...]:
     by_name: dict[str, Task] = {}
     for task in tasks:
         if by_name.setdefault(task.name, task) != task:
-            raise ConfigError(f"'{text}' has two different tasks of the name '{task.name}'")
+            raise ConfigError(
+                f"'{text}' has two different tasks of the name '{task.name}'; rename one of their "
+                'files'
+            )
     return tasks
 
 

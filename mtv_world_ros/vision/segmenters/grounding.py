@@ -21,7 +21,7 @@ Tensor = Any  # torch is imported where it is used
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Normalisation:
-    """Channels become (x / 255 - mean) / std."""
+    """Normalisation of image channels: (x / 255 - mean) / std."""
 
     mean: tuple[float, float, float]
     std: tuple[float, float, float]

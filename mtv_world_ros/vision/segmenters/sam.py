@@ -105,7 +105,7 @@ def sam2_segmenter(
     grounding: GroundingConfig | None = None,
     tracking: TrackingConfig | None = None,
 ) -> PromptedSegmenter:
-    """Load both models.
+    """Load Grounding DINO and SAM 2, and return the segmenter that uses them.
 
     Raises:
         CheckpointError: a folder does not hold the model.
@@ -249,7 +249,7 @@ def sam3_segmenter(
     grounding: GroundingConfig = SAM3_SCORES,
     tracking: TrackingConfig | None = None,
 ) -> PromptedSegmenter:
-    """Load the model.
+    """Load SAM 3, and return the segmenter that uses it.
 
     Raises:
         CheckpointError: the folder does not hold it.
