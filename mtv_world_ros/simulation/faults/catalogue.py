@@ -53,7 +53,7 @@ class _Catalogue(dict[str, FaultKind]):
 FAULTS: Mapping[str, FaultKind] = _Catalogue(
     {name: kind for module in _FAMILIES for name, kind in module.fault.kinds.items()}
 )
-_NAMES = {name: kind for kind, fault in FAULTS.items() for name in (kind, fault.alias)}
+_NAMES = {name: kind for kind, fault in FAULTS.items() for name in (kind, fault.alias) if name}
 _ALL = f"the {len(FAULTS)} kinds that 'mtv-world rank --list-faults' prints"
 
 

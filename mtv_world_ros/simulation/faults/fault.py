@@ -85,7 +85,7 @@ class FaultKind:
     """One way in which a policy fails.
 
     Attributes:
-        alias: another name, which earlier recordings have.
+        alias: another name, which earlier recordings have; empty for a kind without one.
         family: group of kinds, e.g. `timing` or `release`.
         split: `train`, `calibrate` or `test`.
         size: typical, largest and ranked sizes of the fault.
