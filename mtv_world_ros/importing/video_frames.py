@@ -215,6 +215,8 @@ def open_video(path: Path) -> Iterator[VideoStream]:
             yield VideoStream(container, path)
     except (av.FFmpegError, OSError, ValueError) as error:  # names in it may be no UTF-8
         reason = placeholder(path) or f'cannot be read: {error}'
+        if isinstance(error, FileNotFoundError):
+            reason = 'is not there; copy it, or correct its path'
         raise EpisodeError(f"video '{path}' {reason}") from error
 
 

@@ -29,7 +29,7 @@ from mtv_world_ros.data.episode import (
 from mtv_world_ros.data.gripper_sources import resting_grippers
 from mtv_world_ros.data.joint_plans import trajectories_to
 from mtv_world_ros.data.measured_joints import mend_rows
-from mtv_world_ros.data.other_formats import zarr_hint
+from mtv_world_ros.data.other_formats import unread_hint
 from mtv_world_ros.data.stream_clocks import check_row_times
 from mtv_world_ros.importing.bags import write_imported
 from mtv_world_ros.importing.calibration_directions import settle_directions
@@ -194,7 +194,8 @@ def find_recordings(folder: Path, mapping: VideoMapping) -> list[VideoRecording]
             found.append(VideoRecording(folder, name))
     if not found:
         raise EpisodeError(
-            f"'{folder}' has no '{mapping.rows}'; give the folder that has them{zarr_hint(folder)}"
+            f"'{folder}' has no '{mapping.rows}'; give the folder that has them"
+            f'{unread_hint(folder)}'
         )
     return sorted(found, key=lambda one: one.name)
 

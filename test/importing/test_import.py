@@ -287,7 +287,7 @@ def test_a_stale_video_index_is_the_reason(is_there, datasets, make_mapping, tmp
     summary = import_dataset(root, make_mapping(), tmp_path / 'out')
     assert summary.made == ([0] if is_there else [])
     said = summary.failed[1]
-    assert ('ends at 1.1000 s' if is_there else 'cannot be read') in said
+    assert ('ends at 1.1000 s' if is_there else 'is not there') in said
     assert "no episode names 'videos/observation.images.front/chunk-000/file-001.mp4'" in said
     assert 'the video index in meta/ is of an earlier state of the dataset' in said
 

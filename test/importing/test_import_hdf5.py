@@ -327,6 +327,21 @@ def test_a_file_that_was_cut_fails_alone(tmp_path, capsys):
 # Formats that are named
 
 
+@pytest.mark.parametrize('shards', ['.', '1.0.0', 'bridge_dataset/1.0.0'])
+@pytest.mark.parametrize('source', ['bag', 'videos', 'lerobot'])
+def test_every_import_names_rlds_where_its_shards_are(tmp_path, capsys, source, shards):
+    """As the debug data set of Octo (BridgeData V2): NAME/1.0.0/NAME-train.tfrecord-..."""
+    folder = tmp_path / 'raw' / shards
+    folder.mkdir(parents=True)
+    (folder / 'bridge_dataset-train.tfrecord-00000-of-00001').write_bytes(b'')
+    words = ['import', source, str(tmp_path / 'raw'), '--out', str(tmp_path / 'out')]
+    mapping = ['--robot', 'franka']
+    if source == 'videos':
+        mapping = ['--mapping', str(write_mapping(tmp_path / 'm.yaml'))]
+    assert main([*words, *mapping]) == 1
+    assert 'RLDS (TFRecord) is not read' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ('make', 'said'),
     [

@@ -183,7 +183,7 @@ def yaw_pitch_roll(R):
     [
         ({'state': {'feature': 'joint', 'joints': {}}}, 'are missing'),
         ({'rows': 'rows/a.json'}, 'must have {name}'),
-        ({'views': {'front': 'videos/{name}/back.mp4'}}, 'cannot be read'),
+        ({'views': {'front': 'videos/{name}/back.mp4'}}, 'is not there'),
         ({'fps': None}, "either 'fps' or 'time'"),
         ({'rows': 'joints/{name}.json'}, "has no 'joints/{name}.json'"),
         ({'viewz': {}}, "unknown key 'viewz'"),
