@@ -4,7 +4,7 @@
 
 FOLDER is where their lines were run: a clone of the repository, or the folder `docs0` that
 `pytest test/docs/test_shell_lines.py --basetemp FOLDER` leaves (without `demo`). Pages and viewers
-are opened in a headless Chromium.
+are opened in a headless Chromium. For `viewer_live` a node is started here.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from test.support.browser import Browser  # noqa: E402
 #: largest width of a picture [px]
 WIDTH = 900
 #: pictures whose words would be too small then; these keep all colours
-WIDE = ('demo', 'viewer')
+WIDE = ('demo', 'viewer', 'viewer_live')
 #: colours of a picture: it is to be small
 NUM_COLOURS = 128
 FILES = {
@@ -45,13 +45,17 @@ FILES = {
 PAGES = {
     'tutorial_ranking': 'out/judge/ranking/ranking.html',
     'tutorial_scores': 'out/tutorial/scores/report.html',
+    'ranking_page': 'out/judge/ranking/ranking.html#rollouts',
     'evaluation_page': 'out/tutorial/scores/report.html#episodes',
 }
 VIEWS = {
     'tutorial_live': 'out/judge/live.rrd',
     'viewer': 'out/tutorial/view.rrd',
     'tutorial_watched': 'out/tutorial/live.rrd',
+    'viewer_live': 'out/live.rrd',
 }
+#: ROS domain in which the node of `viewer_live` runs, so that it meets no other
+DOMAIN = '176'
 
 
 def save(picture: Path, name: str) -> None:
@@ -132,6 +136,26 @@ def viewer_picture(file: Path, picture: Path, wait_s: float) -> None:
         viewer.wait()
 
 
+def record_live(folder: Path) -> None:
+    """Record what `mtv-world view --live` shows while the node imagines the bundled episode."""
+    environment = {**os.environ, 'ROS_DOMAIN_ID': DOMAIN}
+    calibration = 'calibration_file:=resource/demo_episode/calibration.yaml'
+    commands = [
+        ['world_model', '--ros-args', '-p', 'place:=simulator/nominal', '-p', calibration],
+        ['mtv-world', 'view', '--live', '--overwrite', '--save', VIEWS['viewer_live']],
+    ]
+    run = partial(subprocess.Popen, cwd=folder, env=environment)
+    programs = Path(sys.executable).parent
+    started = [run([str(programs / name), *words]) for name, *words in commands]
+    try:
+        replay = ['replay', 'resource/demo_episode', '--lock-step']
+        assert run([str(programs / 'mtv-world'), *replay]).wait() == 0, 'the replay failed'
+    finally:
+        for process in reversed(started):
+            process.send_signal(signal.SIGINT)
+            process.wait()
+
+
 def main() -> None:
     """Make them all."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -149,6 +173,8 @@ def main() -> None:
             elif name in PAGES:
                 page_picture(options.folder, file, picture)
             else:
+                if name == 'viewer_live':
+                    record_live(options.folder)
                 viewer_picture(source, picture, options.wait)
             save(picture, name)
 
