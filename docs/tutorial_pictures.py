@@ -31,10 +31,12 @@ from test.support.browser import Browser  # noqa: E402
 
 #: largest width of a picture [px]
 WIDTH = 900
+#: time for the first frames of a page's videos [s]
+PAGE_WAIT_S = 5
 #: pictures whose words would be too small then; these keep all colours
 WIDE = ('demo', 'viewer', 'viewer_live')
 #: colours of a picture: it is to be small
-NUM_COLOURS = 128
+NUM_COLOURS = 256
 FILES = {
     'demo': 'out/demo/contact_sheet.png',
     'tutorial_expert': 'out/judge/expert/episode_00000/contact_sheet.png',
@@ -68,7 +70,8 @@ def save(picture: Path, name: str) -> None:
     small = cv2.resize(shown, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     image = Image.fromarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB))
     out = ROOT / 'docs' / f'{name}.png'
-    (image if name in WIDE else image.quantize(NUM_COLOURS)).save(out, optimize=True)
+    few = image.quantize(NUM_COLOURS, kmeans=2)  # without k-means orange becomes red
+    (image if name in WIDE else few).save(out, optimize=True)
     sys.stdout.write(f'{out}: {out.stat().st_size // 1024} kB\n')
 
 
@@ -76,6 +79,7 @@ def page_picture(folder: Path, page: str, picture: Path) -> None:
     """Open a page of a folder."""
     with served(folder) as address, opened(picture.parent) as browser:
         browser.open(f'{address}/{page}')
+        time.sleep(PAGE_WAIT_S)
         browser.picture(picture)
 
 
