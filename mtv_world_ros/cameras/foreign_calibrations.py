@@ -106,7 +106,7 @@ class FramePose:
 
     @property
     def turned_round(self) -> FramePose:
-        """The same numbers read as the pose of the parent in the child."""
+        """Pose of the same numbers, taken as that of the parent in the child."""
         return FramePose(
             parent=self.parent,
             child=self.child,

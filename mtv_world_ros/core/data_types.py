@@ -397,7 +397,7 @@ class SuccessEstimate:
 
     @property
     def trust(self) -> str:
-        """How far it is to be trusted, in one sentence.
+        """One sentence on the trust in the estimate.
 
         It begins with `fitted here`, `not fitted here` or `cannot tell, because`.
         """

@@ -79,7 +79,7 @@ class RecordingReader:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedEpisode:
-    """What a training needs to know of an episode before a clip is cut from it.
+    """Metadata of an episode that a training needs before it cuts a clip from it.
 
     Attributes:
         path: folder of the episode.

@@ -105,7 +105,7 @@ def towards_other_object_and_back(move: MovePlan, size: float) -> MovePlan:
 
 @fault.second_arm('budge', FaultSize(0.015, 0.12, (0.01, 0.02), 'm'), needs=GRIPPERS_OF_TWO)
 def second_arm_moves_goal_object(move: MovePlan, size: float, other: OtherArm) -> Visit:
-    """Meanwhile the other arm takes what is next to the goal and moves it this far."""
+    """The other arm meanwhile takes what is next to the goal, and moves it this far."""
 
     def ways(share: float) -> Stops:
         there = replace(other.above(nearest_to_goal(move), share), yaw=0.0, opening=1.0)

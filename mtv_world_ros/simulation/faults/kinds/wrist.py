@@ -61,7 +61,7 @@ def rocking_before_release(move: MovePlan, size: float) -> MovePlan:
 
 @fault.way_points('list', FaultSize(0.65, 0.9, (0.6, 0.7), 'rad'))
 def lean_with_reach(move: MovePlan, size: float) -> MovePlan:
-    """How far the wrist leans where its arm reaches out most; less where it reaches less far."""
+    """The wrist leans with the reach of its arm, by this angle where it reaches farthest."""
     side, farthest = move.side(), max(map(move.reach, move.stops))
     return move.edit(
         ('all',), lambda stop: stop.turned(lean=move.reach(stop) / farthest * side * size)
