@@ -30,7 +30,8 @@ from mtv_world_ros.importing.convert import (
     START_NS,
     unknown_camera_note,
 )
-from mtv_world_ros.importing.lerobot import EpisodeEntry, LeRobotDataset
+from mtv_world_ros.importing.lerobot import LeRobotDataset
+from mtv_world_ros.importing.lerobot_metadata import EpisodeEntry
 from mtv_world_ros.importing.mapping import DatasetMapping, digest_of, load_mapping, Stream
 from mtv_world_ros.importing.stored_objects import AS_RECORDED, ObjectStage
 from mtv_world_ros.importing.unused_parts import unused_features

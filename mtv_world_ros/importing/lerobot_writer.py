@@ -26,7 +26,7 @@ from mtv_world_ros.core.files import check_free, write_json
 from mtv_world_ros.core.images import encode_png, resize_frames
 from mtv_world_ros.data.episode_reader import read_episode, read_info
 from mtv_world_ros.data.recording import load_recording, Recording
-from mtv_world_ros.importing.lerobot import pyarrow_modules
+from mtv_world_ros.importing.parquet_tables import pyarrow_modules
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.resample import nearest_rows, resample
 

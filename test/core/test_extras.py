@@ -7,7 +7,7 @@ import pytest
 from mtv_world_ros.core import ray_actors
 from mtv_world_ros.core.errors import ConfigError, MissingPackageError
 from mtv_world_ros.core.extras import extra_of, install_command, needs_text
-from mtv_world_ros.importing.lerobot import pyarrow_modules
+from mtv_world_ros.importing.parquet_tables import pyarrow_modules
 from mtv_world_ros.model.tensor_files import import_transformers
 from mtv_world_ros.viewing.rerun_log import check_installed
 

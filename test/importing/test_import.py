@@ -21,8 +21,9 @@ from pyarrow import compute, parquet
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import ConfigError, EpisodeError, MtvWorldError
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.importing.lerobot import frames_at, LeRobotDataset
+from mtv_world_ros.importing.lerobot import LeRobotDataset
 from mtv_world_ros.importing.lerobot_episodes import import_dataset
+from mtv_world_ros.importing.video_frames import frames_at
 from mtv_world_ros.vision.segmenters.examples import ObjectExamples
 
 START_NS = 1_000_000_000

@@ -17,7 +17,7 @@ import yaml
 from mtv_world_ros.cli import main
 from mtv_world_ros.core.errors import ConfigError, EpisodeError
 from mtv_world_ros.data.episode_reader import read_episode
-from mtv_world_ros.importing import lerobot
+from mtv_world_ros.importing import parquet_tables
 from mtv_world_ros.importing.lerobot import LeRobotDataset
 from mtv_world_ros.importing.lerobot_episodes import import_dataset
 
@@ -308,7 +308,7 @@ def test_a_text_that_is_repeated_does_not_fill_the_memory(datasets, tmp_path):
 def test_short_texts_that_are_repeated_are_read(datasets, tmp_path):
     file = tmp_path / 'tasks.parquet'
     repeated_text(file, 'stack the red block', 200_000)
-    assert lerobot._text_bytes(file, ['task']) == 200_000 * len('stack the red block')
+    assert parquet_tables.text_bytes(file, ['task']) == 200_000 * len('stack the red block')
 
 
 def test_a_column_with_dots_in_its_name_does_not_fill_the_memory(tmp_path):
@@ -316,5 +316,5 @@ def test_a_column_with_dots_in_its_name_does_not_fill_the_memory(tmp_path):
     file = tmp_path / 'rows.parquet'
     repeated_text(file, 'x' * 2_000_000, 20_000, column='observation.images.top')
     with pytest.raises(EpisodeError, match=r'rows.parquet.* 40000000000 bytes'):
-        lerobot._read_table(file, columns=['observation.images.top', 'task_index'])
-    assert lerobot._read_table(file, columns=['task_index']).num_rows == 20_000
+        parquet_tables.read_table(file, columns=['observation.images.top', 'task_index'])
+    assert parquet_tables.read_table(file, columns=['task_index']).num_rows == 20_000

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mtv_world_ros.cli.parser import Commands
     from mtv_world_ros.data.episode import Episode
     from mtv_world_ros.importing.convert import ImportSummary
-    from mtv_world_ros.importing.lerobot import EpisodeEntry
+    from mtv_world_ros.importing.lerobot_metadata import EpisodeEntry
 
 
 def add(commands: Commands) -> None:
