@@ -143,9 +143,10 @@ def viewer_picture(file: Path, picture: Path, wait_s: float) -> None:
 def record_live(folder: Path) -> None:
     """Record what `mtv-world view --live` shows while the node imagines the bundled episode."""
     environment = {**os.environ, 'ROS_DOMAIN_ID': DOMAIN}
-    calibration = 'calibration_file:=resource/demo_episode/calibration.yaml'
+    parameters = ['place:=simulator/nominal', 'compressed_input:=true']
+    parameters += ['calibration_file:=resource/demo_episode/calibration.yaml']
     commands = [
-        ['world_model', '--ros-args', '-p', 'place:=simulator/nominal', '-p', calibration],
+        ['world_model', '--ros-args', *(w for p in parameters for w in ('-p', p))],
         ['mtv-world', 'view', '--live', '--overwrite', '--save', VIEWS['viewer_live']],
     ]
     run = partial(subprocess.Popen, cwd=folder, env=environment)

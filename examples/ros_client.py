@@ -42,7 +42,8 @@ def send_moment():
         size = {'header': header, 'height': pixels.shape[0], 'width': pixels.shape[1]}
         data = {'encoding': 'rgb8', 'step': 3 * pixels.shape[1], 'data': pixels.tobytes()}
         images[view].publish(Image(**size, **data))
-        infos[view].publish(CameraInfo(**size, k=camera.K.ravel()))
+        lens = {'distortion_model': camera.distortion_model, 'd': camera.distortion}
+        infos[view].publish(CameraInfo(**size, **lens, k=camera.K.ravel()))
     joints.publish(JointState(header=Header(stamp=stamp), name=names, position=position))
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from math import prod, sqrt
 from typing import Any
 
@@ -81,8 +82,8 @@ class ObservationBuffer:
         time: time of the node; None = samples are not compared with a clock when they arrive.
 
     Attributes:
-        image_hint: returns for a view of which no image came where its images may be; empty = it
-            is not known.
+        image_hint: returns for a view of which no image came, or none came lately, where its
+            images may be; empty = it is not known.
     """
 
     def __init__(
@@ -369,7 +370,8 @@ class ObservationBuffer:
         newest = {view: images.newest[0] for view, images in self._images.items()}
         for view, stamp in newest.items():
             what = f"the newest image of view '{view}'"
-            _check_age(Reason.IMAGE_STALE, what, stamp, now_ns, limits.max_image_age_s)
+            hint = partial(self.image_hint, view)
+            _check_age(Reason.IMAGE_STALE, what, stamp, now_ns, limits.max_image_age_s, hint=hint)
         picked = self._picked(now_ns, limits)
         stamps = [stamp for stamp, _ in picked]
         skew = _skew_s(picked)
@@ -650,16 +652,23 @@ def _freshness(what: str, samples: Samples[Any], now_ns: int, limit: float) -> l
 
 
 def _check_age(
-    reason: Reason, what: str, stamp_ns: int, now_ns: int, limit: float, refusal: str = ''
+    reason: Reason,
+    what: str,
+    stamp_ns: int,
+    now_ns: int,
+    limit: float,
+    refusal: str = '',
+    hint: Callable[[], str] = str,
 ) -> None:
     age = (now_ns - stamp_ns) / NANO
     if abs(age) <= limit:
         return
     when = f'{age:.3f} s old' if age > 0 else f'stamped {-age:.3f} s in the future'
+    where = f'{found}; ' if (found := hint()) else ''
     raise Rejection(
         reason,
-        f"{what} is {when}{_because(refusal)}; '{_AGE_LIMITS[reason]}' allows {limit:g} s (for "
-        "recorded data at its own time set 'use_sim_time' and play with a clock)",
+        f"{what} is {when}{_because(refusal)}; {where}'{_AGE_LIMITS[reason]}' allows {limit:g} s "
+        "(for recorded data at its own time set 'use_sim_time' and play with a clock)",
     )
 
 

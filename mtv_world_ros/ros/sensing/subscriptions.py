@@ -193,12 +193,13 @@ def subscribe_observations(
 def _other_image_topic(
     node: Node, topics: Mapping[str, str], compressed: Collection[str], view: str
 ) -> str:
-    """Return that a view's images are published in the other form; empty = they are not."""
-    is_compressed = view in compressed
-    other = node.resolve_topic_name(
-        f'{topics[view]}/image_raw' + ('' if is_compressed else '/compressed')
+    """Return that a view's images are published in the other form alone; empty = they are not."""
+    is_compressed, forms = view in compressed, ('', '/compressed')
+    own, other = (
+        node.resolve_topic_name(f'{topics[view]}/image_raw{forms[is_compressed == is_own]}')
+        for is_own in (True, False)
     )
-    if not node.count_publishers(other):
+    if node.count_publishers(own) or not node.count_publishers(other):
         return ''
     form, value = ('raw', 'false') if is_compressed else ('compressed', 'true')
     return f"'{other}' publishes {form} images: set the parameter 'compressed_input' to {value}"

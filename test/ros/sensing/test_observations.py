@@ -193,6 +193,20 @@ def test_clearing_forgets_images_and_joints_but_not_the_cameras(make_buffer, ros
     assert buffer.observe(NOW).observation.stamp_ns == NOW
 
 
+def hint_of(compressed, *published):
+    """Return where images may be, in a graph with the published topics."""
+
+    class Node:
+        def resolve_topic_name(self, topic):
+            return f'/cell/{topic}'
+
+        def count_publishers(self, topic):
+            return int(topic in published)
+
+    topics = {'low': 'low', 'high': 'high'}
+    return partial(subscriptions._other_image_topic, Node(), topics, compressed)
+
+
 @pytest.mark.parametrize(
     ('compressed', 'published', 'said'),
     [
@@ -202,20 +216,35 @@ def test_clearing_forgets_images_and_joints_but_not_the_cameras(make_buffer, ros
     ],
 )
 def test_images_of_the_other_form_are_named(make_buffer, compressed, published, said):
-    class Node:
-        def resolve_topic_name(self, topic):
-            return f'/cell/{topic}'
-
-        def count_publishers(self, topic):
-            return int(topic == published)
-
     buffer = make_buffer()
     buffer.add_joint_state(joints(NOW, a=0.0, b=0.0))
-    topics = {'low': 'low', 'high': 'high'}
-    buffer.image_hint = partial(subscriptions._other_image_topic, Node(), topics, compressed)
+    buffer.image_hint = hint_of(compressed, published)
     with pytest.raises(Rejection, match=re.escape(said)) as refused:
         buffer.observe(NOW)
     assert refused.value.reason == Reason.IMAGE_MISSING
+
+
+@pytest.mark.parametrize(
+    ('published', 'said'),
+    [
+        (('low', 'low/compressed'), "is 2.000 s old; 'max_image_age_s' allows"),
+        (
+            ('low/compressed',),
+            "is 2.000 s old; '/cell/low/image_raw/compressed' publishes compressed images: set",
+        ),
+    ],
+)
+def test_images_that_go_on_in_the_other_form_are_named(make_buffer, ros, published, said):
+    """A client of raw images has ended, and a recording of compressed ones is played."""
+    buffer = make_buffer()
+    buffer.add_joint_state(joints(NOW + 2 * NANO, a=0.0, b=0.0))
+    for view in ('low', 'high'):
+        buffer.add_image(view, ros.make_image(view, NOW))
+    topics = [f'/cell/{topic}'.replace('low', 'low/image_raw') for topic in published]
+    buffer.image_hint = hint_of((), *topics)
+    with pytest.raises(Rejection, match=re.escape(said)) as refused:
+        buffer.observe(NOW + 2 * NANO)
+    assert refused.value.reason == Reason.IMAGE_STALE
 
 
 def test_cameras_that_swap_their_views_are_refused_until_a_reset(make_buffer, ros):
