@@ -31,6 +31,8 @@ from test.support.browser import Browser  # noqa: E402
 
 #: largest width of a picture [px]
 WIDTH = 900
+#: opens the first card of a section that is the target of an address
+_SHOW_FIRST = "document.querySelector(':target details')?.setAttribute('open', '')"
 #: time for the first frames of a page's videos [s]
 PAGE_WAIT_S = 5
 #: pictures whose words would be too small then; these keep all colours
@@ -79,6 +81,7 @@ def page_picture(folder: Path, page: str, picture: Path) -> None:
     """Open a page of a folder."""
     with served(folder) as address, opened(picture.parent) as browser:
         browser.open(f'{address}/{page}')
+        browser.run(_SHOW_FIRST)
         time.sleep(PAGE_WAIT_S)
         browser.picture(picture)
 
