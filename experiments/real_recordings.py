@@ -705,7 +705,7 @@ def _foreseen_from(
     words = []
     if start:
         stopped, fingers = watch_fingers(motion.openings[:, : start + 1], period_s)
-        seen, kept = motion.first(start + 1), ()
+        seen, kept, held = motion.first(start + 1), (), ()
         if memory == 'on':
             sights = Sights.begin(names, seen)
             sights = sights.after(seen, masks[:, :, : start + 1], stopped, period_s)
@@ -713,13 +713,14 @@ def _foreseen_from(
                 replace(fingers, is_refuted=sights.refuted),
                 sights.kept(seen.last().tools[:, 0]),
             )
+            held = sights.held
             words = [
                 f'{name} {"held" if one.is_held else "stays"} {one.age_s:.1f} s'
                 for name, one in zip(names, kept, strict=True)
                 if one is not None
             ]
         given = recording.cameras, list(motion.camera_poses[:, start])
-        tracked, _, _ = foresight.find_again(whole, names, masks[:, :, start], *given, kept)
+        tracked, _, _ = foresight.find_again(whole, names, masks[:, :, start], *given, kept, held)
         tracked = tracked.with_fingers(fingers)
     views, (height, width) = len(recording.cameras), masks.shape[-2:]
     found = FoundObjects(

@@ -300,8 +300,9 @@ class ObjectForesight:
         if whole is None:
             return FoundObjects.at(names, frames, masks, poses, self.model.find(*given))
         kept: tuple[KeptPose | None, ...] = ()
+        held: tuple[bool, ...] = ()
         if self.sights is not None and self.sights.names == names:
-            kept = self.sights.kept(motion.tools[:, 0])
-        tracked, same, hidden = self.model.find_again(whole.tracked, *given, kept)
+            kept, held = self.sights.kept(motion.tools[:, 0]), self.sights.held
+        tracked, same, hidden = self.model.find_again(whole.tracked, *given, kept, held)
         found = FoundObjects.at(names, frames, masks, poses, tracked).shown_as(whole, hidden)
         return replace(found, is_whole=bool(same.all()))

@@ -42,6 +42,8 @@ class GripSettings:
             they hold: the error of its size [m].
         beside_m: distance of the tool point from every solid beyond which stopped fingers
             contradict a future: something is between them, and no solid is [m].
+        max_overlap_m: largest overlap of a held solid with the one below that comes from the error
+            of the cameras: it is put upon it; a larger one pushes [m].
         contradiction: factor by which such a stop makes a future less likely; fingers may also
             stop at something that has no name.
     """
@@ -56,6 +58,7 @@ class GripSettings:
     max_width_ratio: float = 1.1
     max_gap_m: float = 0.015
     beside_m: float = 0.04
+    max_overlap_m: float = 0.015
     contradiction: float = 0.1
 
 
@@ -255,6 +258,8 @@ class GripCourse:
         poses = poses.copy()
         for item, grip in kept.items():
             poses[item] = self.tools[grip.arm, row] @ grip.T_tool_solid
+        for item in kept:
+            poses[item, 2, 3] += _overlap(item, poses, solids, self.settings.max_overlap_m)
         busy = {grip.arm for grip in kept.values()}
         for arm in map(int, np.flatnonzero(self.stopped[:, row])):
             if arm in busy or not holds(arm):
@@ -305,15 +310,16 @@ class GripCourse:
         """Number of the solid between the fingers; None = no solid is there."""
         settings, tool = self.settings, self.tools[arm, row]
         gap = self.openings[arm, row] * self.widths[arm]
-        near: list[tuple[float, int]] = []
+        near: list[tuple[bool, float, int]] = []
         for item, solid in enumerate(solids):
             is_too_wide = min(solid.size[:2]) > settings.max_width_ratio * self.widths[arm]
             if item in kept or is_too_wide or gap > max(solid.size) + settings.max_gap_m:
                 continue
             outside_m, from_centre_m = _outside(solid, poses[item], tool)
             if outside_m < settings.reach_m + solid.error_m:
-                near.append((from_centre_m, item))
-        return min(near)[1] if near else None
+                # at the start frames may have shown what goes along with the hand
+                near.append((row > 0 or not solid.is_held, from_centre_m, item))
+        return min(near)[2] if near else None
 
 
 def _outside(solid: Solid, pose: FloatArray, tool: FloatArray) -> tuple[float, float]:
@@ -321,6 +327,28 @@ def _outside(solid: Solid, pose: FloatArray, tool: FloatArray) -> tuple[float, f
     local = np.linalg.inv(pose) @ tool[:, 3]
     outside = np.maximum(np.abs(local[:3]) - np.asarray(solid.size) / 2, 0.0)
     return float(np.linalg.norm(outside)), float(np.linalg.norm(local[:3]))
+
+
+def _overlap(item: int, poses: FloatArray, solids: Sequence[Solid], most: float) -> float:
+    """Return how far a solid reaches into the one that its centre is above [m]; 0 = none.
+
+    Args:
+        item: number of the solid.
+        poses: (O, 4, 4) T_base_solid [m].
+        solids: the O solids as found.
+        most: largest overlap that counts [m].
+    """
+    halves = np.stack([np.asarray(solid.size) / 2 for solid in solids])
+    heights = (np.abs(poses[:, 2, :3]) * halves).sum(-1)
+    found = 0.0
+    for other, solid in enumerate(solids):
+        if other == item or solid.is_open:
+            continue
+        local = np.linalg.inv(poses[other]) @ poses[item, :, 3]
+        into = poses[other, 2, 3] + heights[other] - (poses[item, 2, 3] - heights[item])
+        if (np.abs(local[:2]) < halves[other, :2]).all() and into <= most:
+            found = max(found, float(into))
+    return found
 
 
 def _wide_open(robot: RobotModel) -> FloatArray:

@@ -199,6 +199,7 @@ class ObjectMotionModel(Protocol):
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
         kept: Sequence[KeptPose | None] = (),
+        held: Sequence[bool] = (),
     ) -> tuple[TrackedObjects, BoolArray, BoolArray]:
         """Return the objects in a frame in which they may be partly hidden.
 
@@ -210,6 +211,8 @@ class ObjectMotionModel(Protocol):
             poses: T_base_camera of each view, (4, 4) [m].
             kept: pose of each object by the last frame that showed it free; None, or an empty
                 sequence: the masks alone say where it is.
+            held: whether frames until then showed each object to go along with stopped fingers;
+                an empty sequence: none was.
 
         Returns:
             The objects; mask (O,) of the objects found with certainty, at their former size; mask

@@ -90,7 +90,8 @@ class Sight:
     Attributes:
         masks: (V, H, W) its masks.
         poses: (V, 4, 4) T_base_camera.
-        point: (3,) middle of the object by the rays of two views [m].
+        point: (3,) middle of the object by the rays of two views, or where a gripper that held it
+            has let it go since [m].
         largest: (V,) largest area so far [px].
         age_s: time since that frame [s].
         near_s: of it, time in which the hand was near [s].
@@ -192,6 +193,14 @@ class Sights:
                 found[sight.arm] = True
         return found
 
+    @property
+    def held(self) -> tuple[bool, ...]:
+        """(O,) whether masks say that an object goes along with stopped fingers."""
+        return tuple(
+            sight is not None and sight.arm is not None and sight.hold is Hold.HELD
+            for sight in self.of_each
+        )
+
     def kept(
         self, tools: FloatArray, settings: SightSettings = _SETTINGS
     ) -> tuple[KeptPose | None, ...]:
@@ -210,8 +219,7 @@ class Sights:
 
     def _kept(self, sight: Sight, tools: FloatArray, settings: SightSettings) -> KeptPose | None:
         is_hidden = sight.age_s > 0
-        stays = not sight.is_moved and sight.is_inside
-        if not is_hidden or not (sight.is_held or stays):
+        if not is_hidden or sight.is_moved or not (sight.is_held or sight.is_inside):
             return None
         moved = np.eye(4)
         if sight.is_held:
@@ -245,12 +253,14 @@ class Sights:
             ],
             axis=1,
         )
-        of_each = [sight and self._let_go(sight, stopped) for sight in self.of_each]
+        of_each = [sight and self._let_go(sight, stopped, tools) for sight in self.of_each]
         for arm in map(int, np.flatnonzero(stopped & ~self.stopped)):
             item = _nearest(of_each, tools[arm, :3, 3], settings)
             sight = None if item is None else of_each[item]
             if item is not None and sight is not None:
-                evidence = HoldEvidence.begin(sight.masks, pixels[arm])
+                # what was carried before lies elsewhere now, and is seen as well as may be
+                start = masks[:, item] if sight.is_moved else sight.masks
+                evidence = HoldEvidence.begin(start, pixels[arm])
                 of_each[item] = replace(sight, arm=arm, tool=tools[arm], evidence=evidence)
         return replace(
             self,
@@ -262,13 +272,18 @@ class Sights:
             tools=tools,
         )
 
-    def _let_go(self, sight: Sight, stopped: BoolArray) -> Sight:
+    def _let_go(self, sight: Sight, stopped: BoolArray, tools: FloatArray) -> Sight:
         """Return a sight after the fingers at it have opened, if they have."""
         if sight.arm is None or stopped[sight.arm]:
             return sight
+        assert sight.tool is not None
+        point = sight.point
+        if sight.hold is Hold.HELD:
+            carried = tools[sight.arm] @ np.linalg.inv(sight.tool)
+            point = carried[:3, :3] @ point + carried[:3, 3]
         # what was held is elsewhere now; what stayed is not
         is_moved = sight.is_moved or sight.hold in (Hold.HELD, Hold.NOT_SEEN)
-        return replace(sight, arm=None, tool=None, evidence=None, is_moved=is_moved)
+        return replace(sight, point=point, arm=None, tool=None, evidence=None, is_moved=is_moved)
 
     def _seen(
         self,

@@ -155,6 +155,7 @@ class SolidForesight:
         cameras: Sequence[CameraModel],
         poses: Sequence[FloatArray],
         kept: Sequence[KeptPose | None] = (),
+        held: Sequence[bool] = (),
     ) -> tuple[TrackedSolids, BoolArray, BoolArray]:
         """Find objects that may be partly hidden; see `ObjectMotionModel.find_again`."""
         points = locate_all(cameras, poses, centroids(masks))
@@ -169,6 +170,9 @@ class SolidForesight:
             before = one and solid and _solid_then(one, solid, floor)
             if before is not None:
                 solids[item], is_kept[item] = before, True
+        for item in map(int, np.flatnonzero(held)):
+            solid = solids[item]
+            solids[item] = solid and replace(solid, is_held=True)
         anew = whole.foresight._found(names, masks, cameras, poses, solids)
         same = np.array([solid is not None for solid in solids], np.bool_)
         hidden = np.array([solid is not None and solid.is_hidden for solid in solids], np.bool_)

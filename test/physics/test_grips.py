@@ -149,6 +149,43 @@ def _retry():
     return np.concatenate([once, down, picking()])
 
 
+@pytest.mark.parametrize('is_held', [True, False])
+def test_fingers_hold_what_frames_showed_to_go_along_and_not_what_is_nearer(lift, is_held):
+    """A block that is about to be put on another one: the tool point is nearer to the lower."""
+    upper = replace(BLOCK, centre=np.array([0.0, 0.0, 0.06]), is_held=is_held)
+    positions = np.tile([0.035, HELD_AT], (2, 1))
+    _, fingers = watch_fingers(lift.gripper_openings(picking()[:51]), 0.02)
+    course = GripCourse.of(lift, positions, 0.1, fingers)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = BLOCK.centre, upper.centre
+    grips, _ = course.after(0, {}, poses, [BLOCK, upper])
+    assert list(grips) == [1 if is_held else 0]
+
+
+@pytest.mark.parametrize(
+    ('other', 'overlap_m', 'raised_m'),
+    [
+        (BLOCK, 0.01, 0.01),  # it is put upon it: cameras are off by a centimetre
+        (BLOCK, 0.03, 0.0),  # it pushes
+        (BLOCK, -0.01, 0.0),  # it is above
+        (replace(BLOCK, is_open=True), 0.01, 0.0),  # it is put into a bowl
+        (replace(BLOCK, centre=np.array([0.1, 0.0, 0.02])), 0.01, 0.0),  # it passes by
+    ],
+)
+def test_what_is_held_is_put_upon_what_it_reaches_into(lift, other, overlap_m, raised_m):
+    """Overlapping solids fly apart when the fingers open."""
+    positions = np.tile([0.035, HELD_AT], (2, 1))
+    _, fingers = watch_fingers(lift.gripper_openings(picking()[:51]), 0.02)
+    course = GripCourse.of(lift, positions, 0.1, fingers)
+    upper = replace(BLOCK, centre=np.array([0.0, 0.0, 0.06 - overlap_m]), is_held=True)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = other.centre, upper.centre
+    grips, _ = course.after(0, {}, poses, [other, upper])
+    assert list(grips) == [1]
+    _, after = course.after(1, grips, poses, [other, upper])
+    assert after[1, 2, 3] - upper.centre[2] == pytest.approx(raised_m, abs=1e-9)
+
+
 @pytest.mark.parametrize(('share', 'first'), [(1.0, True), (0.5, True), (0.3, False)])
 def test_stops_hold_in_their_share_of_the_futures(lift, share, first):
     batch = small_scene.batch_of(

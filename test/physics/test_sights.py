@@ -96,9 +96,22 @@ def test_what_fingers_hold_keeps_its_place_in_the_gripper():
     stopped = [0, 0] + [1] * 9
     sights = _watched(way, way, [1, 1] + [0.4] * 9, stopped)
     assert sights.of_each[0].hold is Hold.HELD and not sights.refuted.any()
+    assert sights.held == (True,)
     (kept,) = sights.kept(_motion(way[-1:]).tools[:, 0])
     assert kept.is_held
     np.testing.assert_allclose(kept.moved[:3, 3], way[-1] - BLOCK, atol=1e-9)
+
+
+def test_a_second_grip_of_an_object_that_was_never_free_in_between_is_seen():
+    """It is let go where the hand is, which keeps hiding a part of it, and is gripped again."""
+    first = _lifted(8, -0.03)
+    way = np.concatenate([_still(3), first, np.tile(first[-1], (3, 1)), first[-2:1:-1]])
+    stopped = [0, 0] + [1] * 9 + [0] * 2 + [1] * 6
+    sights = _watched(way, way, [1, 1] + [0.4] * 17, stopped)
+    assert sights.held == (True,)
+    np.testing.assert_allclose(sights.of_each[0].point, first[-1], atol=0.01)
+    # it is visible now, and looked for there; the place from before the first grip is not kept
+    assert sights.kept(_motion(way[-1:]).tools[:, 0]) == (None,)
 
 
 def test_a_stop_that_held_nothing_leaves_the_object_where_it_was():

@@ -446,7 +446,7 @@ class DriftingObjects:
         self._log.append(0)
         return self
 
-    def find_again(self, whole, names, masks, cameras, poses, kept=()):
+    def find_again(self, whole, names, masks, cameras, poses, kept=(), held=()):
         assert whole is self and masks.shape[:2] == (len(cameras), 2)
         self._log.append(1)
         return self, np.array(self._same), np.array([True, False])
