@@ -84,7 +84,7 @@ def order_table(order: PolicyOrder) -> Table:
     return Table(
         caption=f'Order of the policies: {order.num_ordered} of {len(order.pairs)} pairs are '
         f'ordered, {order.num_scenes} scene{"s" * (order.num_scenes != 1)} under common futures',
-        head=['', 'policy', 'strength', 'better than', 'not told from'],
+        head=['no.', 'policy', 'strength', 'better than no.', 'not told from no.'],
         rows=rows,
         num_labels=2,
     )
