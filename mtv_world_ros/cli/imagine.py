@@ -112,6 +112,9 @@ def _replay(arguments: argparse.Namespace) -> int:
 def _play(arguments: argparse.Namespace) -> int:
     import runpy
 
+    from mtv_world_ros.core.progress import Progress
+
+    Progress.num_shown += 1  # the player logs what it does: it is not loading any more
     sys.argv = ['mtv-world replay', str(arguments.episode), *arguments.ros]
     runpy.run_module('mtv_world_ros.ros.bags.player', run_name='__main__')
     return 0
