@@ -265,3 +265,11 @@ def test_a_command_that_still_loads_says_so_until_it_shows_its_progress(capsys, 
     assert first == 'mtv-world: replay: loading'
     assert second.startswith('mtv-world: replay: loading, ') and second.endswith(' s so far')
     assert capsys.readouterr().err == ''
+
+
+def test_a_player_does_not_load_while_it_plays(capsys, monkeypatch):
+    monkeypatch.setattr('mtv_world_ros.cli._FIRST_LINE_S', 0.05)
+    monkeypatch.setattr('mtv_world_ros.cli._NEXT_LINE_S', 0.06)
+    monkeypatch.setattr('runpy.run_module', lambda *_, **__: time.sleep(0.5))
+    assert main(['replay', 'x']) == 0
+    assert capsys.readouterr().err.splitlines() in ([], ['mtv-world: replay: loading'])
