@@ -37,7 +37,7 @@ AWAY = Solid(centre=np.array([1.0, 1.0, 0.025]), size=np.full(3, 0.05), yaw=0.3)
 @pytest.fixture(scope='module')
 def recording(robot):
     read = read_contact(share_path('resource', 'demo_episode'), robot, ('low', 'high'))
-    return _Trial.of(read, SETTINGS)
+    return _Trial.of(read, SETTINGS, robot)
 
 
 def masses_of(solids) -> list[float]:
