@@ -70,13 +70,25 @@ def draw_sigmas(draws: NoiseDraws, config: ObjectiveConfig) -> Tensor:
     return torch.where(full, torch.ones(()), shifted)
 
 
-def pixel_weights(frames: Tensor, object_ids: Tensor | None, config: ObjectiveConfig) -> Tensor:
+def pixel_weights(
+    frames: Tensor,
+    object_ids: Tensor | None,
+    config: ObjectiveConfig,
+    attempted: Tensor | None = None,
+) -> Tensor:
     """Return (B, V, T, H, W) weights of the future frames' pixels, at least 1.
+
+    `change_weight`, `object_weight` and `moved_weight` follow what happened: a pixel at the end of
+    a carry counts more in the clip where the object came there than in the one where the grasp
+    missed, and a model that is unsure gains by imagining that it came. `attempt_weight` counts
+    both places in both clips, and favours neither.
 
     Args:
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
         object_ids: (B, V, 1 + T, H, W) uint8 instance ids, 0 = none; None where unknown.
         config: extra weights of pixels.
+        attempted: (B, V, 1 + T, H, W) bool places of attempts, see `clips.attempted`; None where
+            objects are not known.
     """
     difference = (frames[:, :, 1:].short() - frames[:, :, :1].short()).abs().amax(-1)
     weights = 1.0 + config.change_weight * (difference > CHANGE_THRESHOLD).float()
@@ -84,6 +96,8 @@ def pixel_weights(frames: Tensor, object_ids: Tensor | None, config: ObjectiveCo
         now, before = object_ids[:, :, 1:], object_ids[:, :, :1]
         weights = weights + config.object_weight * (now > 0).float()
         weights = weights + config.moved_weight * (now != before).float()
+    if attempted is not None:
+        weights = weights + config.attempt_weight * attempted[:, :, 1:].float()
     return weights
 
 

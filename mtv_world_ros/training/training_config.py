@@ -84,6 +84,12 @@ class ObjectiveConfig(Schema):
     moved_weight: Weight = Field(
         default=10.0, description='extra weight of pixels where objects came or went'
     )
+    attempt_weight: Weight = Field(
+        default=0.0,
+        description='extra weight of pixels where an object was that a gripper closes at, and '
+        'where it would carry it; unlike the three above it is the same for a grasp and a miss, '
+        'so that an imagined grasp gains nothing',
+    )
 
 
 class AugmentConfig(Schema):

@@ -268,6 +268,44 @@ def goes_along(
     return evidence.hold(settings)
 
 
+def attempted_places(
+    masks: BoolArray,
+    openings: FloatArray,
+    tools: FloatArray,
+    settings: HoldSettings = SETTINGS,
+) -> BoolArray:
+    """Return (V, N, H, W) where an object was that a gripper closes at, and would be if it held.
+
+    From where it closed the object goes along with the tool until the gripper opens, and stays
+    there; and it stays where it was. Which of both it does changes nothing.
+
+    Args:
+        masks: (V, O, N, H, W) masks of the objects.
+        openings: (N,) openings of the gripper, 0 closed to 1 open.
+        tools: (V, N, 2) pixels of the tool.
+        settings: definition of an attempt.
+    """
+    found = attempts(openings, settings)
+    rows, margin = len(openings), round(settings.margin * masks.shape[-1])
+    if 1 - openings[0] >= settings.closes_by:
+        opens = np.flatnonzero(openings > openings[0] + settings.opens_by)
+        found = [(0, int(opens[0]) if len(opens) else rows), *found]  # it closed before
+    places = np.zeros((len(masks), *masks.shape[2:]), np.bool_)
+    for closed, opened in found:
+        nearest = nearest_object(masks, tools[:, closed], closed, settings)
+        if nearest is None:
+            continue
+        for view in range(len(masks)):
+            of_view = masks[view, nearest, : closed + 1]
+            if not of_view.any() or not np.isfinite(tools[view]).all():
+                continue
+            start = _last_shown(of_view)
+            for row in range(closed, rows):
+                way = tools[view, min(row, opened - 1)] - tools[view, closed]
+                places[view, row] |= start | grown(_shifted(start, way), margin)
+    return places
+
+
 def _last_shown(masks: BoolArray) -> BoolArray:
     """Return the last of masks (N, H, W) that shows half of the largest area or more."""
     areas = masks.sum((-2, -1))

@@ -50,6 +50,28 @@ def test_changed_pixels_and_objects_weigh_more():
     ]
 
 
+def test_places_of_attempts_weigh_the_same_however_a_clip_goes_on():
+    """A tool goes from left to right; the object goes along, or it stays where it was."""
+    frames = torch.zeros(1, 1, 3, 1, 64, 3, dtype=torch.uint8)
+    places = torch.zeros(1, 1, 3, 1, 64, dtype=torch.bool)
+    grasped, missed = (torch.zeros(1, 1, 3, 1, 64, dtype=torch.uint8) for _ in range(2))
+    for frame, column in enumerate((4, 20, 40)):
+        places[0, 0, frame, 0, [4, column]] = True
+        grasped[0, 0, frame, 0, column] = missed[0, 0, frame, 0, 4] = 1
+
+    def weights(ids, config):
+        return pixel_weights(frames, ids, config, places)[0, 0, :, 0]
+
+    by_outcome = CONFIG.replace(attempt_weight=0.0)
+    assert weights(grasped, by_outcome)[1, 40] > weights(missed, by_outcome)[1, 40]
+    none = dict.fromkeys(('change_weight', 'object_weight', 'moved_weight'), 0.0)
+    by_plan = CONFIG.replace(attempt_weight=7.0, **none)
+    assert torch.equal(weights(grasped, by_plan), weights(missed, by_plan))
+    assert weights(grasped, by_plan)[1].tolist() == [
+        8.0 if x in (4, 40) else 1.0 for x in range(64)
+    ]
+
+
 def test_latent_weights_lie_where_the_autoencoder_puts_the_pixels():
     """Encoding an image of weights with three equal colours gives the weights of the latents."""
     weights = torch.rand(1, 2, 3, 8, 6)

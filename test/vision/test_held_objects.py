@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.cameras.camera import unknown_camera
-from mtv_world_ros.vision.held_objects import attempts, Hold, judge_stops
+from mtv_world_ros.vision.held_objects import (
+    attempted_places,
+    attempts,
+    Hold,
+    judge_stops,
+    tools_in_views,
+)
 
 _WIDTH, _HEIGHT, _FRAMES, _CLOSED = 96, 72, 14, 4
 _AWAY = 4.0 * np.maximum(np.arange(_FRAMES) - _CLOSED, 0)
@@ -95,3 +101,34 @@ def test_fingers_that_close_far_from_every_object_have_none():
 )
 def test_a_gripper_attempts_when_its_fingers_have_closed(openings, expected):
     assert attempts(np.array(openings, float)) == expected
+
+
+def _places(columns, openings):
+    return attempted_places(_masks(columns), openings, tools_in_views(_motion(), 0))
+
+
+def test_places_of_an_attempt_are_those_of_the_grasp_and_of_the_miss():
+    openings = np.where(np.arange(_FRAMES) < _CLOSED - 1, 1.0, 0.2)
+    (closed, _), *_ = attempts(openings)
+    grasped, missed = _places(_GOES, openings), _places(_STAYS, openings)
+    assert (grasped == missed).all()
+    assert not missed[:, :closed].any()
+    for columns in (_GOES, _STAYS):
+        shown = _masks(columns)[:, 0, closed:]
+        assert (shown & ~missed[:, closed:]).sum() == 0
+
+
+def test_what_a_tool_lets_go_would_stay_where_it_opened():
+    frames, opened = np.arange(_FRAMES), _FRAMES - 3
+    openings = np.where((frames < _CLOSED - 1) | (frames >= opened), 1.0, 0.2)
+    places = _places(_STAYS, openings)
+    assert (places[:, opened:] == places[:, opened - 1 : opened]).all()
+
+
+def test_a_gripper_that_closed_before_the_first_frame_carries_what_it_is_at():
+    places = _places(_GOES, np.full(_FRAMES, 0.2))
+    assert (_masks(_GOES)[:, 0] & ~places).sum() == 0
+
+
+def test_a_gripper_that_stays_open_attempts_nothing():
+    assert not _places(_STAYS, np.ones(_FRAMES)).any()

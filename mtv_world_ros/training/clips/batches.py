@@ -14,12 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.control import Control, ControlInputs
 from mtv_world_ros.control.registry import create_control
-from mtv_world_ros.core.data_types import ByteArray
+from mtv_world_ros.core.data_types import BoolArray, ByteArray
 from mtv_world_ros.core.errors import TrainingError
 from mtv_world_ros.data.recording import Recording
-from mtv_world_ros.data.recordings import cut_clip
+from mtv_world_ros.data.recordings import Clip, cut_clip
 from mtv_world_ros.model.conditioning import ControlBatch
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.clips.clip_controls import (
@@ -33,6 +34,7 @@ from mtv_world_ros.training.clips.clip_controls import (
 from mtv_world_ros.training.clips.episode_index import IndexedEpisode
 from mtv_world_ros.training.clips.step_loader import StepLoader
 from mtv_world_ros.training.training_config import TrainingConfig
+from mtv_world_ros.vision.held_objects import attempted_places, tools_in_views
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 #: largest standard deviation of the noise of a disturbed start frame, as a share of full range
@@ -48,6 +50,7 @@ class ClipBatch:
         start_frame: (B, V, H, W, 3) uint8 RGB, frame 0 as the model sees it (maybe disturbed).
         inputs: inputs of the control.
         object_ids: (B, V, 1 + T, H, W) uint8, zero in clips without; None where no clip has them.
+        attempted: (B, V, 1 + T, H, W) bool, likewise; see `attempted`.
         anchor: (B, V, H, W, 3) uint8 RGB, the first frame of the clip's rollout, in models with a
             history; see `draw_past`.
         history: (B, V, N, H, W, 3) uint8 RGB frames before the clip, in such models.
@@ -63,6 +66,7 @@ class ClipBatch:
     start_frame: Tensor
     inputs: ControlBatch
     object_ids: Tensor | None
+    attempted: Tensor | None = None
     anchor: Tensor | None = None
     history: Tensor | None = None
     history_sigmas: Tensor | None = None
@@ -93,6 +97,7 @@ class _Sample(NamedTuple):
     start_frame: ByteArray
     inputs: ControlInputs
     object_ids: ByteArray | None
+    attempted: BoolArray | None
     past: Past | None
     lead_in: LeadIn | None
 
@@ -143,6 +148,7 @@ class BatchSource:
             segmenter=segmenter,
             control=control or create_control(config.video.control, config.control_options(robot)),
         )
+        self._weighs_attempts = config.objective.attempt_weight > 0
         self._foreseen_ratio = config.rendering.foreseen_ratio
         self._spec, self._augment, self._seed = spec, config.augment, seed
         self._history, self._self_rollout = config.history, config.self_rollout
@@ -172,6 +178,7 @@ class BatchSource:
             start_frame=torch.from_numpy(np.stack([s.start_frame for s in samples])),
             inputs=ControlBatch.of([s.inputs for s in samples]),
             object_ids=_stacked([s.object_ids for s in samples]),
+            attempted=_stacked([s.attempted for s in samples]),
             lead_ins=tuple(s.lead_in for s in samples),
             **history_fields([s.past for s in samples]),
         )
@@ -205,7 +212,8 @@ class BatchSource:
             start = _disturb(start, rng)
         whole = np.ascontiguousarray(frames)
         lead_in = lead_in and replace(lead_in, names=names, foresees=foresees)
-        return _Sample(whole, start.copy(), inputs, clip.object_ids, past, lead_in)
+        places = attempted(clip, self.controls.robot) if self._weighs_attempts else None
+        return _Sample(whole, start.copy(), inputs, clip.object_ids, places, past, lead_in)
 
     def _past(
         self, recording: Recording, start: int, lead_in: LeadIn | None, rng: np.random.Generator
@@ -240,8 +248,24 @@ def history_fields(given: Sequence[Past | None]) -> dict[str, Tensor]:
     }
 
 
-def _stacked(ids: Sequence[ByteArray | None]) -> Tensor | None:
-    """Return the ids of a batch, zero in clips that have none; None if no clip has any."""
+def attempted(clip: Clip, robot: RobotModel) -> BoolArray | None:
+    """Return (V, 1 + T, H, W) where objects are that grippers close at, or would be if they held.
+
+    Whether they do hold does not change it. None where the objects of the clip are not known.
+    """
+    if clip.object_ids is None:
+        return None
+    ids = np.arange(1, len(clip.objects) + 1).reshape(1, -1, 1, 1, 1)
+    masks = clip.object_ids[:, None] == ids
+    motion = Motion.of(robot, clip.cameras, clip.positions)
+    places = np.zeros(clip.object_ids.shape, np.bool_)
+    for arm, openings in enumerate(motion.openings):
+        places |= attempted_places(masks, openings, tools_in_views(motion, arm))
+    return places
+
+
+def _stacked(ids: Sequence[np.ndarray | None]) -> Tensor | None:
+    """Return the arrays of a batch, zero in clips that have none; None if no clip has any."""
     known = next((part for part in ids if part is not None), None)
     if known is None:
         return None

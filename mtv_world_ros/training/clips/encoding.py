@@ -89,10 +89,12 @@ def encode_batch(
     frames = batch.frames.to(device)
     clean = encode_chunk(encoders.autoencoder, frames).float()
     ids = None if batch.object_ids is None else batch.object_ids.to(device)
+    attempted = None if batch.attempted is None else batch.attempted.to(device)
+    weights = pixel_weights(frames, ids, objective, attempted)
     return EncodedBatch(
         clean=clean,
         conditioning=condition_batch(encoders, batch, device),
-        weights=_weights(pixel_weights(frames, ids, objective), encoders.autoencoder, clean),
+        weights=_weights(weights, encoders.autoencoder, clean),
     )
 
 

@@ -28,7 +28,12 @@ from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.data.recordings import cut_clip
 from mtv_world_ros.model.conditioning import Conditioning, ControlBatch, pad_rows, start_slot
 from mtv_world_ros.training.base_checkpoint import Base
-from mtv_world_ros.training.clips.batches import BatchSource, ClipBatch, history_fields
+from mtv_world_ros.training.clips.batches import (
+    attempted,
+    BatchSource,
+    ClipBatch,
+    history_fields,
+)
 from mtv_world_ros.training.clips.clip_controls import ControlMaker, draw_past, history_before
 from mtv_world_ros.training.clips.encoding import encode_batch, EncodedBatch, Encoders
 from mtv_world_ros.training.clips.episode_index import digest_of, IndexedEpisode, robot_digest
@@ -183,11 +188,11 @@ def _other_settings(root: Path, mine: Mapping[str, Any]) -> list[str]:
 
 
 #: to be increased when the stored data or their computation change
-_VERSION = 2
+_VERSION = 3
 #: name of the tokens of a control, whose number differs between clips
 CONTEXT = 'context'
 #: kinds of pixels with extra weight, in the order of a cache's `shares`
-WEIGHTS = ('change_weight', 'object_weight', 'moved_weight')
+WEIGHTS = ('change_weight', 'object_weight', 'moved_weight', 'attempt_weight')
 _NO_WEIGHTS = ObjectiveConfig(change_weight=0.0, object_weight=0.0, moved_weight=0.0)
 #: stale clips that a note names
 _MOST_NAMED = 3
@@ -263,7 +268,7 @@ def read_clip(
     """
     recording = clip.episode.recording()
     cut = cut_clip(recording, clip.start, spec)
-    inputs = controls.make(cut, recording.names)
+    inputs, places = controls.make(cut, recording.names), attempted(cut, controls.robot)
     past = None
     if history.on:
         rng = np.random.default_rng((_VERSION, clip.start))
@@ -274,6 +279,7 @@ def read_clip(
         start_frame=_alone(cut.frames[:, 0]),
         inputs=ControlBatch.of([inputs]),
         object_ids=None if cut.object_ids is None else _alone(cut.object_ids),
+        attempted=None if places is None else _alone(places),
         **history_fields([past]),  # type: ignore[arg-type]
     )
 
@@ -346,11 +352,11 @@ def _encode(
 
 
 def _shares(batch: ClipBatch, shape: Sequence[int]) -> Tensor:
-    """(B, 3, V, F, h, w) uint8 shares of each latent that change, show an object, or lose one."""
+    """(B, 4, V, F, h, w) uint8 shares of each latent that a kind of weight counts."""
     parts = []
     for name in WEIGHTS:
         one = _NO_WEIGHTS.replace(**{name: 1.0})
-        weights = pixel_weights(batch.frames, batch.object_ids, one)
+        weights = pixel_weights(batch.frames, batch.object_ids, one, batch.attempted)
         parts.append(pooled_weights(weights, shape)[:, :, 0] - 1)
     return (torch.stack(parts, dim=1) * 255).round().to(torch.uint8)
 

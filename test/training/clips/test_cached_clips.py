@@ -17,7 +17,7 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.model.conditioning import condition, ControlBatch, encode_chunk
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.training.base_checkpoint import Base, load_base
-from mtv_world_ros.training.clips.batches import BatchSource
+from mtv_world_ros.training.clips.batches import attempted, BatchSource
 from mtv_world_ros.training.clips.latent_cache import cached_batches, CachedSource
 from mtv_world_ros.training.distributed import Processes
 from mtv_world_ros.training.objective import pixel_weights, pooled_weights
@@ -31,7 +31,7 @@ CPU = torch.device('cpu')
 @pytest.fixture(scope='module')
 def config(tmp_path_factory) -> TrainingConfig:
     config = load_training_config(tiny_preset(tmp_path_factory.mktemp('preset')))
-    objective = config.objective.replace(change_weight=4.0, moved_weight=10.0)
+    objective = config.objective.replace(change_weight=4.0, moved_weight=10.0, attempt_weight=2.0)
     return config.replace(objective=objective)
 
 
@@ -100,9 +100,10 @@ def test_a_batch_is_what_encoding_the_recorded_clips_gives(source, tmp_path, con
     torch.testing.assert_close(batch.conditioning.image[1], tokens.clone())
     assert torch.equal(batch.conditioning.text[1], base.encoders.text[0])
     ids = torch.from_numpy(cut.object_ids)[None]
-    weights = pooled_weights(pixel_weights(frames, ids, config.objective), clean.shape)
-    # shares are kept as bytes: half a byte of each of the weights, 4 and 10
-    torch.testing.assert_close(batch.weights[1:], weights, rtol=0, atol=14 * 0.5 / 255 + 1e-6)
+    places = torch.from_numpy(attempted(cut, source.controls.robot))[None]
+    weights = pooled_weights(pixel_weights(frames, ids, config.objective, places), clean.shape)
+    # shares are kept as bytes: half a byte of each of the weights, 4, 10 and 2
+    torch.testing.assert_close(batch.weights[1:], weights, rtol=0, atol=16 * 0.5 / 255 + 1e-6)
 
 
 def test_clips_are_shown_what_came_before_them(source, root, config, base):
