@@ -22,6 +22,8 @@ from mtv_world_ros.rollout import offline
 from mtv_world_ros.rollout.offline import ReplaySummary
 from mtv_world_ros.viewing import sheets
 
+DEMO = str(share_path('resource', 'demo_episode'))
+
 
 def run(*arguments: str, cwd: Path, timeout: float = 300) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
@@ -85,7 +87,7 @@ def test_an_option_that_left_says_what_to_use_now(capsys):
         (['train', 'nowhere', '--out', 'run'], 'holds no episodes'),
         (['train', '.', '--out', 'run', '--preset', 'smal'], "did you mean 'small'"),
         (['train', '.', '--out', 'run', '--set', 'optimizer.step=3'], "did you mean 'steps'"),
-        (['train', '.', '--out', 'run', '--dtype', 'int8'], "dtype 'int8' is not one of"),
+        (['train', DEMO, '--out', 'run', '--dtype', 'int8'], "dtype 'int8' is not one of"),
         (['evaluate', 'nowhere', '.', '--out', 'x'], 'is not a checkpoint'),
         (['replay', 'nowhere', '--offline'], 'nowhere'),
         (['collect', '--task', 'stack_blocks', '--episodes', '1', '--out', 'x'],
@@ -225,6 +227,7 @@ def test_an_offline_replay_fails_if_plans_were_rejected_and_says_the_first(
     rejected = [(10**9 * k, f'joints would jump at {k} s') for k in range(num_rejected)]
     summary = ReplaySummary(out=tmp_path, num_trajectories=4, rejected=rejected)
     monkeypatch.setattr(imagine, 'open_checkpoints', lambda *_: (None,))
+    monkeypatch.setattr(imagine, 'refuse_for', lambda *_: None)
     monkeypatch.setattr(imagine, 'pipeline_of', lambda _: AnyPipeline())
     monkeypatch.setattr(offline, 'replay_offline', lambda *_, **__: summary)
     monkeypatch.setattr(sheets, 'write_pictures', lambda *_: ())
