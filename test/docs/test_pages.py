@@ -65,12 +65,14 @@ def test_the_four_numbers_of_the_readme_are_those_of_the_results_pages():
     row = re.search(r'\| foreseen motions alone \|.*?\| (\d+) of (1\d+) \|', faults)
     given, plans = map(int, row.groups())
     assert f'{plans - given} of {plans} plans get no verdict' in text
-    speed = results_page('foresight_cpu2_2026-11-27')
+    speed = results_page('foresight_cpu2_2026-11-29')
+    numbers = r' \| '.join([r'([\d.]+)'] * 3)
     row = re.search(
-        r'\| this \| realtime \| 1 \| 3.2 \|.*?\| 10 \| 10 \| ([\d.]+) \| ([\d.]+)', speed
+        rf'\| this \| realtime \| 1 \| 3.2 \|.*?\| 10 \| 10 \| 10 \| {numbers} \|', speed
     )
-    delay, lead = map(float, row.groups())
+    first, delay, lead = map(float, row.groups())
     assert f'comes {delay:.1f} s after a plan**, {lead:.1f} s before the motion ends' in text
+    assert f'without pictures, after {first:.1f} s' in text
 
 
 #: a visitor reads the README in two minutes
