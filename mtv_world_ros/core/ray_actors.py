@@ -57,7 +57,10 @@ def started(make_run: Callable[[], Run], workers: Workers, num_jobs: int) -> Ite
         needed = tuple(path.absolute() for path in workers.reads)
         actor = ray.remote(num_cpus=workers.cpus, num_gpus=workers.gpus)(_Actor)
         options = (make_run, workers.num_threads, Path.cwd(), needed, marker)
-        yield _Actors(ray, lambda: actor.remote(*options), min(workers.count, num_jobs)).run
+        actors = _Actors(
+            ray, [actor.remote(*options) for _ in range(min(workers.count, num_jobs))]
+        )
+        yield actors.run
     except ray.exceptions.RayError as error:
         raise MtvWorldError(
             f'Ray failed ({error}); what is done is kept: run the command again'
@@ -193,20 +196,16 @@ class _Actors:
     """Actors of a Ray cluster that run jobs; the job of one that dies goes to another.
 
     An actor gets its first job when it has started: a cluster with fewer cores than actors starts
-    the others later, or never. One that dies before, on a machine that is gone, is made again.
+    the others later, or never.
     """
 
-    def __init__(self, ray: Any, make: Callable[[], Any], count: int) -> None:
-        self._ray, self._make, self._num_left, self._num_made_again = ray, make, count, 0
+    def __init__(self, ray: Any, actors: Sequence[Any]) -> None:
+        self._ray, self._num_left = ray, len(actors)
         #: what an actor is at: its job's number and the job; None = it starts
-        self._calls: dict[Any, tuple[Any, tuple[int, Any] | None]] = {}
+        self._calls: dict[Any, tuple[Any, tuple[int, Any] | None]] = {
+            actor.start.remote(): (actor, None) for actor in actors
+        }
         self._idle: list[Any] = []
-        for _ in range(count):
-            self._start()
-
-    def _start(self) -> None:
-        actor = self._make()
-        self._calls[actor.start.remote()] = actor, None
 
     def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, Any]]:
         """Yield jobs with their result.
@@ -227,10 +226,6 @@ class _Actors:
             try:
                 found = self._ray.get(done)
             except self._ray.exceptions.RayActorError as error:
-                if one is None and self._num_made_again < MAX_LOST_ACTORS:
-                    self._num_made_again += 1
-                    self._start()
-                    continue
                 self._lose(one, lost, error)
                 waiting.extendleft([] if one is None else [one])
                 continue

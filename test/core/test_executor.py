@@ -1,11 +1,9 @@
 import os
 import signal
 import sys
-from types import SimpleNamespace
 
 import pytest
 
-from mtv_world_ros.core import ray_actors
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.executor import run_all, score_all
 from mtv_world_ros.core.workers import Workers
@@ -104,47 +102,6 @@ def test_ray_scores_as_processes_do(make_scorer):
     assert found[3] == 'three has no half' and found[4] == {'job': 4, 'half': 2.0, 'nothing': None}
 
 
-class _Gone(Exception):
-    """Stands for `RayActorError`."""
-
-
-def _cluster(machines_gone):
-    """Return a Ray whose first actors never start, and a function that makes an actor."""
-    made = []
-
-    def make():
-        made.append(len(made) < machines_gone)
-        is_gone = made[-1]
-        start = SimpleNamespace(remote=lambda: (is_gone, len(made), None))
-        run = SimpleNamespace(remote=lambda job: (False, len(made), job))
-        return SimpleNamespace(start=start, run=run)
-
-    def get(call):
-        if call[0]:
-            raise _Gone('it never ran')
-        return call[2] if call[2] is None else -call[2]
-
-    exceptions = SimpleNamespace(RayActorError=_Gone)
-    ray = SimpleNamespace(
-        wait=lambda calls: (calls[:1], calls[1:]), get=get, exceptions=exceptions
-    )
-    return ray, make, made
-
-
-def test_a_ray_worker_that_never_started_is_made_again():
-    """The cluster may give it to a machine that is gone already."""
-    ray, make, made = _cluster(machines_gone=1)
-    assert list(ray_actors._Actors(ray, make, 1).run([3, 4])) == [(3, -3), (4, -4)]
-    assert len(made) == 2
-
-
-def test_workers_that_never_start_are_an_error():
-    ray, make, made = _cluster(machines_gone=99)
-    with pytest.raises(MtvWorldError, match='all Ray workers died'):
-        list(ray_actors._Actors(ray, make, 1).run([3]))
-    assert len(made) == 1 + ray_actors.MAX_LOST_ACTORS
-
-
 def test_without_ray_the_extra_is_named(make_scorer, monkeypatch):
     monkeypatch.setitem(sys.modules, 'ray', None)
     monkeypatch.setenv('RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER', '0')  # is set, and given back
@@ -220,6 +177,8 @@ def test_a_file_that_a_machine_lacks_is_named(make_adder, tmp_path):
 
 
 def test_a_folder_of_results_that_a_machine_does_not_see_is_named(tmp_path, monkeypatch):
+    from mtv_world_ros.core import ray_actors
+
     monkeypatch.setattr(ray_actors, 'SHARED_FILE_TIMEOUT_S', 0.0)
     problem = ray_actors._unseen([], tmp_path / 'out' / '.workers_1')
     assert f"does not see '{tmp_path / 'out'}'" in str(problem)
