@@ -164,8 +164,9 @@ def own_process(what: str, work: Path, *, count: int = 1, number: int = 0) -> li
         check=True, cwd=ROOT, stdout=subprocess.PIPE, text=True,
         env={**os.environ, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT)},
     )  # fmt: skip
-    rows = [line for line in done.stdout.splitlines() if line.startswith(_MARK)]
-    return [json.loads(row.removeprefix(_MARK)) for row in rows]
+    # lines of two processes may stand on one
+    parts = done.stdout.split(_MARK)[1:]
+    return [json.JSONDecoder().raw_decode(part)[0] for part in parts]
 
 
 def measured_process(what: str, work: Path, number: int) -> None:
