@@ -404,9 +404,10 @@ def _held_out_paths(arguments: argparse.Namespace, trained_on: Sequence[Path]) -
     from mtv_world_ros.data.splits import select, spread
 
     dataset = arguments.held_out or arguments.dataset
-    found = [select(dataset, default=split) for split in _SPLITS]
-    selection = next((one for one, split in zip(found, _SPLITS, strict=True)
-                      if one.split == split), found[0])  # fmt: skip
+    selection = select(dataset, default=_SPLITS[0])
+    for split in _SPLITS[1:]:
+        if selection.split not in _SPLITS:
+            selection = select(dataset, default=split)
     if selection.split not in _SPLITS and arguments.held_out is None:
         raise ConfigError(
             f"--sample-every needs held-out episodes, '{dataset}' has no split val or test; give "

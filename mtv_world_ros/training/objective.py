@@ -87,7 +87,7 @@ def pixel_weights(
         frames: (B, V, 1 + T, H, W, 3) uint8 RGB.
         object_ids: (B, V, 1 + T, H, W) uint8 instance ids, 0 = none; None where unknown.
         config: extra weights of pixels.
-        attempted: (B, V, 1 + T, H, W) bool places of attempts, see `clips.attempted`; None where
+        attempted: (B, V, 1 + T, H, W) bool places of attempts, see `batches.attempted`; None where
             objects are not known.
     """
     difference = (frames[:, :, 1:].short() - frames[:, :, :1].short()).abs().amax(-1)

@@ -35,7 +35,7 @@ from mtv_world_ros.training.clips.episode_index import IndexedEpisode
 from mtv_world_ros.training.clips.step_loader import StepLoader
 from mtv_world_ros.training.training_config import TrainingConfig
 from mtv_world_ros.vision.held_objects import attempted_places, tools_in_views
-from mtv_world_ros.vision.segmenters.segmenter import Segmenter
+from mtv_world_ros.vision.segmenters.segmenter import masks_from_ids, Segmenter
 
 #: largest standard deviation of the noise of a disturbed start frame, as a share of full range
 START_NOISE_STD = 0.04
@@ -253,10 +253,9 @@ def attempted(clip: Clip, robot: RobotModel) -> BoolArray | None:
 
     Whether they do hold does not change it. None where the objects of the clip are not known.
     """
-    if clip.object_ids is None:
+    if clip.object_ids is None or not clip.objects:
         return None
-    ids = np.arange(1, len(clip.objects) + 1).reshape(1, -1, 1, 1, 1)
-    masks = clip.object_ids[:, None] == ids
+    masks = masks_from_ids(clip.object_ids, clip.objects, clip.objects).masks
     motion = Motion.of(robot, clip.cameras, clip.positions)
     places = np.zeros(clip.object_ids.shape, np.bool_)
     for arm, openings in enumerate(motion.openings):
