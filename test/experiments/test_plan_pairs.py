@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
-from pathlib import Path
-import sys
-
 import pytest
 
 from mtv_world_ros.success.share_fit import ShareEstimate
-
-ROOT = Path(__file__).resolve().parents[2]
+from test.support.scripts import imported_scripts
 
 
 @pytest.fixture(scope='module')
 def script():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        yield importlib.import_module('plan_pairs')
-    sys.modules.pop('plan_pairs', None)
+    with imported_scripts('plan_pairs') as (module,):
+        yield module
 
 
 def log(*scenes):

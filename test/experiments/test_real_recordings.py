@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
 from math import nan
-from pathlib import Path
-import sys
 
 import numpy as np
 import pytest
 
 from mtv_world_ros.core.data_types import SuccessEstimate
-
-ROOT = Path(__file__).resolve().parents[2]
+from test.support.scripts import imported_scripts
 
 
 @pytest.fixture(scope='module')
 def script():
     """The script, which imports its neighbour `page`."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        yield importlib.import_module('real_recordings')
-    for name in ('real_recordings', 'page'):
-        sys.modules.pop(name, None)
+    with imported_scripts('real_recordings') as (module,):
+        yield module
 
 
 def score(recording, view, arm, moving):

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
-from pathlib import Path
-import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mtv_world_ros.core.transforms import about_z
-
-ROOT = Path(__file__).resolve().parents[2]
+from test.support.scripts import imported_scripts
 
 
 @pytest.fixture(scope='module')
 def scripts():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        yield [importlib.import_module(name) for name in ('silent_failures', 'joint_zeros')]
-    for name in ('silent_failures', 'joint_zeros', 'shifted_worlds', 'plan_pairs', 'page'):
-        sys.modules.pop(name, None)
+    with imported_scripts('silent_failures', 'joint_zeros') as modules:
+        yield modules
 
 
 def course(heights, yaws):

@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from argparse import Namespace
-import importlib
 from math import isnan, nan
 from pathlib import Path
 import re
-import sys
 
 import pytest
 
 from mtv_world_ros.success.calibration import Calibration
 from mtv_world_ros.success.share_fit import ShareEstimate
-
-ROOT = Path(__file__).resolve().parents[2]
+from test.support.scripts import imported_scripts
 
 
 @pytest.fixture(scope='module')
 def script():
     """The script, which imports its neighbours `page` and `shifted_worlds`."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        yield importlib.import_module('unseen_faults')
-    for name in ('unseen_faults', 'shifted_worlds', 'plan_pairs', 'page'):
-        sys.modules.pop(name, None)
+    with imported_scripts('unseen_faults') as (module,):
+        yield module
 
 
 def lines(hits, count):

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-from pathlib import Path
-import sys
-
 import numpy as np
 import pytest
 
@@ -15,17 +11,13 @@ from mtv_world_ros.physics.engine.futures import draw_futures
 from mtv_world_ros.physics.solids import Solid
 from mtv_world_ros.success.estimator import verdict
 from test.support import small_scene
-
-ROOT = Path(__file__).resolve().parents[2]
+from test.support.scripts import imported_scripts
 
 
 @pytest.fixture(scope='module')
 def script():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        yield importlib.import_module('learnt_contact')
-    for name in ('learnt_contact', 'shifted_worlds', 'plan_pairs', 'page'):
-        sys.modules.pop(name, None)
+    with imported_scripts('learnt_contact') as (module,):
+        yield module
 
 
 @pytest.fixture(scope='module')

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-from pathlib import Path
 import re
 import shutil
 import sys
@@ -14,8 +12,8 @@ import pytest
 
 from mtv_world_ros.model.card import OBJECT_MOTION_FOLDER
 from mtv_world_ros.model.checkpoint import checkpoint_folder
+from test.support.scripts import imported_scripts
 
-ROOT = Path(__file__).resolve().parents[2]
 #: the gripper holds too wide, and the block stays where it is
 FAULTY = 'expert-grip_loose-1'
 
@@ -23,11 +21,8 @@ FAULTY = 'expert-grip_loose-1'
 @pytest.fixture(scope='module')
 def benchmark():
     """The benchmark's script, which imports its neighbour `page`."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        yield importlib.import_module('shifted_worlds')
-    for name in ('shifted_worlds', 'plan_pairs', 'page'):
-        sys.modules.pop(name, None)
+    with imported_scripts('shifted_worlds') as (module,):
+        yield module
 
 
 @pytest.mark.slow

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 import re
-import sys
 
 import numpy as np
 import pytest
+
+from test.support.scripts import imported_scripts
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -15,13 +16,9 @@ ROOT = Path(__file__).resolve().parents[3]
 @pytest.fixture(scope='module')
 def benchmark(tmp_path_factory):
     """The benchmark's script, which imports its neighbour `page`."""
-    import importlib
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        yield importlib.import_module('interval_coverage')
-    for name in ('interval_coverage', 'page'):
-        sys.modules.pop(name, None)
+    with imported_scripts('interval_coverage') as (module,):
+        yield module
 
 
 @pytest.mark.parametrize('name', ['t, mean of J', 'Wilson, share of independent trials'])
