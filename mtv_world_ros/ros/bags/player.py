@@ -422,12 +422,12 @@ class Player(Node):
             if self._options.lock_step and message.msgtype == TRAJECTORY:
                 self._flush()  # the plan starts from what came before it
             stamp_ns = self._publish(timeline, message)
+            self._was_reported = self._was_reported or self._is_reported()
             if message.msgtype != TRAJECTORY:
                 continue
             bag_s = (message.stamp_ns - self._first_ns) / NANO
             topic = self._outputs[message.topic].topic_name
             self._plans.append(PlayedPlan(topic=topic, bag_s=bag_s, stamp_ns=stamp_ns))
-            self._was_reported = self._was_reported or self._is_reported()
             if self._options.lock_step:
                 self._wait_for_answer(timeline, message.stamp_ns, stamp_ns)
 

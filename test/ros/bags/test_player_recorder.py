@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 import pytest
 import rclpy
+from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import CompressedImage, JointState
@@ -284,9 +285,13 @@ def test_plans_of_a_node_that_ended_meanwhile_are_a_failure(episode, launch, cli
     reports = client.node.create_publisher(ros.REPORT, '/ended/report', 10)
     taken = client.received['/joint_trajectory']
     taken.clear()
-    # slowly: the player has to know the publisher before it goes, on a busy machine, too
     options = ('--rate', '0.2', '--answer-timeout', '20', '--report-topic', '/ended/report')
     player = launch('player', episode, *options)
+    # the player has to know the publisher before it goes, on a busy machine, too: an
+    # acknowledgement comes from a reader that knows its writer
+    client.wait(lambda: reports.get_subscription_count() > 0, 'the player to read reports', 60)
+    reports.publish(ros.REPORT())
+    assert reports.wait_for_all_acked(Duration(seconds=60))
     client.wait(lambda: len(taken) >= len(PLANS), 'both plans')
     client.node.destroy_publisher(reports)
     code, said = finish(player)
