@@ -224,3 +224,37 @@ def test_masks_that_refute_a_stop_let_it_hold_nothing(lift):
     # the next stop, after the fingers opened, may hold again
     _, opened = watch_fingers(np.array([[0.625, 1.0]]), 0.2, refuted)
     assert not opened.is_refuted.any()
+
+
+#: a wide low block, and one above it that fingers hold
+LOWER = Solid(centre=np.array([0.0, 0.0, 0.02]), size=np.array([0.06, 0.09, 0.04]))
+HELD = replace(BLOCK, centre=np.array([0.0, 0.0, 0.061]), is_held=True)
+
+
+def releasing(height):
+    """Measured positions (N, 2) of fingers that hold something, open, and rise; and before."""
+    times = np.arange(0, 2.01, 0.02)
+    width = HELD_AT + (0.04 - HELD_AT) * np.clip((times - 0.4) / 0.2, 0, 1)
+    rising = height + 0.1 * np.clip((times - 1.0) / 0.5, 0, 1)
+    return np.stack([rising, width], -1)
+
+
+@pytest.mark.parametrize(
+    ('aside_m', 'height'),
+    [
+        (0.0, 0.065),  # as seen
+        (0.012, 0.065),  # a finger is drawn into the held block
+        (0.0, 0.035),  # the fingers are drawn into the lower block
+        (0.012, 0.035),
+    ],
+)
+def test_what_fingers_let_go_stays_where_it_was_put(lift, aside_m, height):
+    """Fingers that cameras draw into a solid would shoot it away once nothing holds it."""
+    _, fingers = watch_fingers(lift.gripper_openings(picking()[:51]), 0.02)
+    seen = [LOWER, replace(HELD, centre=HELD.centre + np.array([0.0, aside_m, 0.0]))]
+    batch = small_scene.batch_of(lift, *seen, num_motions=2, grips_hold=True, squeeze=0.1)
+    commands = releasing(height)
+    motion, state = batch.advance(commands, 5, batch.start(commands[0], fingers))
+    assert not any(state.grips) and not any(state.passed)
+    moved = motion.points[:, -1] - motion.points[:, 0]
+    np.testing.assert_allclose(moved, 0.0, atol=0.003)

@@ -22,6 +22,8 @@ from mtv_world_ros.robot.model import RobotModel
 
 #: what can touch what: solids are bit 0, each arm has a bit of its own
 SOLIDS = 1
+#: bit of solids that arms pass through
+PASSED = 1 << 30
 #: natural frequency of the drive of a joint that was not fitted [rad/s]
 DEFAULT_FREQUENCY_RAD_S = 40.0
 #: damping time of the drive of a joint that was not fitted [s]
@@ -142,7 +144,7 @@ class Arms:
         for joint, parts in self._parts.items():
             arm = arm_of.get(joint)
             # what stands still touches solids alone
-            own, touches = (0, SOLIDS) if arm is None else (
+            own, touches = (0, SOLIDS | PASSED) if arm is None else (
                 bits[arm], SOLIDS + sum(bits) - bits[arm]
             )  # fmt: skip
             for part in parts:

@@ -5,7 +5,7 @@ Shape letters: O solids, D degrees of freedom of the arms.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import FloatArray
 from mtv_world_ros.core.errors import RobotError
-from mtv_world_ros.physics.arms.arms import Arms, PATCH_M, set_drives, SOLIDS
+from mtv_world_ros.physics.arms.arms import Arms, PASSED, PATCH_M, set_drives, SOLIDS
 from mtv_world_ros.physics.contact_settings import ContactSettings
 from mtv_world_ros.physics.mujoco_import import mujoco
 from mtv_world_ros.physics.solids import Solid
@@ -161,13 +161,26 @@ class CompiledScene:
         model.geom_friction[is_finger, 0] = settings.grip_friction
         model.geom_friction[:, 1] = PATCH_M
         model.geom_pos[0, 2] = settings.table_m
-        model.geom_conaffinity[0] = SOLIDS if settings.table_varies else -1
+        model.geom_conaffinity[0] = SOLIDS | PASSED if settings.table_varies else -1
         model.eq_active0[:] = not settings.fingers_swing
         for number, solid in enumerate(solids):
             _set_pieces(model, self._bodies[number], self._geoms[number],
                         _pieces(solid, settings, self.kinds[number]))  # fmt: skip
         mujoco.mj_setConst(model, mujoco.MjData(model) if data is None else data)
         return model
+
+    def let_pass(self, model: Any, solids: Iterable[int]) -> None:
+        """Let arms pass through solids of these numbers in a model, and touch the others."""
+        passed = set(solids)
+        for number, geoms in enumerate(self._geoms):
+            is_passed = number in passed
+            model.geom_contype[geoms] = PASSED if is_passed else SOLIDS
+            model.geom_conaffinity[geoms] = SOLIDS | PASSED if is_passed else -1
+
+    def solid_of(self, geom: int) -> int | None:
+        """Return the number of the solid that a shape of the model is a piece of, if any."""
+        found = (number for number, geoms in enumerate(self._geoms) if geom in geoms)
+        return next(found, None)
 
     def positions(self, arms: FloatArray, solids: Sequence[Solid]) -> FloatArray:
         """Return MuJoCo's qpos for arm positions (D,) and the poses of the solids."""

@@ -74,6 +74,9 @@ _LIMITS = DivergenceLimits()
 CONTACT_RANGE_M = 0.015
 #: distance at which contact between a finger and the table is simulated [m]
 TABLE_CONTACT_RANGE_M = 0.002
+#: depth to which contact lets an arm reach into a solid; a start at which it is deeper in
+#: contradicts itself, as the cameras are off [m]
+MAX_CONTACT_DEPTH_M = 0.005
 #: wall-clock limit of one plan: SLOWDOWN_LIMIT times its duration plus EXTRA_S; a safeguard only,
 #: because wall time depends on the load of the machine
 SLOWDOWN_LIMIT = 20.0
@@ -99,6 +102,8 @@ class BatchState:
             number of the solid, for each future.
         fingers: measured motion of the fingers until now; None = not known.
         stops: stops of the measured fingers until now; None = none were looked for.
+        passed: solids that arms pass through in each future: what measured fingers hold or
+            held, or reached into at the start, until they are apart; empty = none are looked for.
     """
 
     physics: FloatArray
@@ -109,6 +114,7 @@ class BatchState:
     grips: tuple[dict[int, Grip], ...] = ()
     fingers: FingerState | None = None
     stops: StopState | None = None
+    passed: tuple[frozenset[int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -303,6 +309,8 @@ class Batch:
             )
             fingers = grips.fingers
             run.grip(grips)
+            if not state.passed:
+                run.passed = [self._reached_into(run, k) for k in range(len(self.futures))]
         cap_s = time.monotonic() + SLOWDOWN_LIMIT * rows * every * PERIOD_S + EXTRA_S
 
         def check() -> None:
@@ -324,6 +332,7 @@ class Batch:
             grips=tuple(run.grips),
             fingers=fingers,
             stops=run.stops,
+            passed=tuple(run.passed),
         )
 
     def _advance_row(self, run: _Run, row: int, check: Callable[[], None]) -> None:
@@ -332,9 +341,38 @@ class Batch:
             for number in range(len(self.futures))
         ]
         moving = np.flatnonzero(~np.array(passing))
+        for number in map(int, moving):
+            self._scene.let_pass(self._models[number], run.passed[number])
         if len(moving):
             self._compute_row(run, row, moving, check)
         run.finish_row(row, moving)
+        for number, passed in enumerate(run.passed):
+            held = frozenset(run.grips[number])
+            left = passed - held
+            if left and number not in run.lost:
+                left &= self._depths(run, number).keys()
+            run.passed[number] = held | left
+
+    def _reached_into(self, run: _Run, number: int) -> frozenset[int]:
+        """Return the solids that arms hold, or reach into by more than contact lets them."""
+        depths = self._depths(run, number)
+        deep = {item for item, depth_m in depths.items() if depth_m > MAX_CONTACT_DEPTH_M}
+        return frozenset(deep) | frozenset(run.grips[number])
+
+    def _depths(self, run: _Run, number: int) -> dict[int, float]:
+        """Return how far arms reach into the solids of a future [m], by number of the solid."""
+        model, data = self._models[number], self._data[0]
+        self._scene.let_pass(model, ())
+        data.qpos[:] = run.qpos(number)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        depths: dict[int, float] = {}
+        for geoms, distance in zip(data.contact.geom, data.contact.dist, strict=True):
+            for solid, other in (geoms, geoms[::-1]):
+                item = self._scene.solid_of(int(solid))
+                if item is not None and model.geom_contype[other] > SOLIDS and distance < 0:
+                    depths[item] = max(depths.get(item, 0.0), -float(distance))
+        return depths
 
     def _compute_row(
         self, run: _Run, row: int, moving: np.ndarray, check: Callable[[], None]
@@ -416,6 +454,7 @@ class _Run:
         self.lost, self.computed = dict(state.lost), 0
         self._spent = np.zeros(len(futures), np.int64)
         self.grips = list(state.grips) or [{} for _ in futures]
+        self.passed = list(state.passed) or [frozenset[int]() for _ in futures]
         self._grip_course: GripCourse | None = None
         self.stops = None if state.stops is None else state.stops.copy()
         self._was_stopped = np.zeros(0, np.bool_)
