@@ -8,7 +8,7 @@
                                 [--out out/real_left_out]
     python experiments/real_recordings.py carried EPISODES --checkpoint CHECKPOINT
     python experiments/real_recordings.py rollouts EPISODES --checkpoint CHECKPOINT [--memory off]
-                                [--foresight off] [--out out/real_rollouts]
+                                [--foresight off] [--task TASK.yaml] [--out out/real_rollouts]
 
 EPISODES is a folder of imported recordings whose cameras are known (`mtv-world fit camera --apply`)
 and whose objects were found (`import ... --objects`).
@@ -43,6 +43,7 @@ from pathlib import Path
 import subprocess
 from typing import Any
 
+import cv2
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
@@ -51,6 +52,8 @@ from page import table
 
 from mtv_world_ros.cameras.camera import camera_poses
 from mtv_world_ros.cameras.motion import Motion
+from mtv_world_ros.control.mark_leaks import has_colour
+from mtv_world_ros.control.trajectory_video import arm_colour, FINGER_COLOURS
 from mtv_world_ros.core.data_types import (
     BoolArray,
     ByteArray,
@@ -285,6 +288,7 @@ def open_pipeline(arguments: argparse.Namespace) -> Pipeline:
         num_threads=1,
         camera_check=False,
         calibrated=False,
+        task=str(arguments.task[0]) if arguments.task else None,
     )
 
 
@@ -368,10 +372,13 @@ def imagine_whole(arguments: argparse.Namespace) -> None:
         if stored.get('made_with') != made_with or not made_with['code']:
             stored = {'made_with': made_with, **_imagine_one(arguments, pipeline, recording)}
             file.write_text(json.dumps(stored, indent=1))
-        print(recording.path.name, stored['estimate'], f'{stored["probability"]:.2f}')
+        low, high = stored['interval']
+        shown = f'{stored["probability"]:.2f} [{low:.2f}, {high:.2f}]'
+        print(recording.path.name, stored['estimate'], shown, stored['verdict'])
         scores += stored['views']
     head = ('recording', 'view', 'J of the arm, first chunk', 'recorded', 'whole', 'recorded',
-            'PSNR, whole [dB]', 'held', 'J of moving objects, whole', 'held')  # fmt: skip
+            'PSNR, whole [dB]', 'held', 'J of moving objects, whole', 'held',
+            'pixels a frame with a mark\'s hue', 'recorded')  # fmt: skip
     rows = [
         (
             score['recording'],
@@ -405,6 +412,8 @@ SCORES = (
     ('psnr_held', 2),
     ('moving', 3),
     ('moving_held', 3),
+    ('marks', 1),
+    ('marks_recorded', 1),
 )
 #: differences whose means over recordings are printed: words, the score, what is taken off
 DIFFERENCES = (
@@ -487,6 +496,8 @@ def _imagine_one(
                 'psnr_held': _psnr(stretch.frames[view, :1], real[view]),
                 'moving': float(moving[view][0]),
                 'moving_held': float(moving[view][1]),
+                'marks': _pixels_of_marks(frames[view], masks.arm),
+                'marks_recorded': _pixels_of_marks(real[view], masks.arm),
                 'arm_of_chunks': arm,
                 'arm_recorded_of_chunks': recorded,
             }
@@ -496,7 +507,17 @@ def _imagine_one(
         'views': views,
         'estimate': list(success.reasons),
         'probability': success.probability,
+        'interval': success.interval,
+        'verdict': verdict_word(success.probability, success.interval),
     }
+
+
+def _pixels_of_marks(shown: ByteArray, arm: BoolArray) -> float:
+    """Return the pixels a frame (T, H, W, 3) at the arm (T, H, W) with the hue of drawn marks."""
+    colours = (arm_colour(0, 1), *FINGER_COLOURS[1:])
+    has_hue = np.any([has_colour(shown, colour) for colour in colours], axis=0)
+    near = [cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0 for mask in arm]
+    return float((has_hue & near).sum() / len(shown))
 
 
 def _psnr(shown: ByteArray, real: ByteArray) -> float:

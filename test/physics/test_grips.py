@@ -258,3 +258,14 @@ def test_what_fingers_let_go_stays_where_it_was_put(lift, aside_m, height):
     assert not any(state.grips) and not any(state.passed)
     moved = motion.points[:, -1] - motion.points[:, 0]
     np.testing.assert_allclose(moved, 0.0, atol=0.003)
+
+
+def test_free_fingers_that_reach_into_a_block_grip_it(lift):
+    """They are about to close on it: it is lifted, and not passed through."""
+    aside = replace(BLOCK, centre=BLOCK.centre + np.array([0.0, 0.03, 0.0]))
+    batch = small_scene.batch_of(
+        lift, aside, num_motions=2, grips_hold=True, squeeze=0.1, stop_holds=0.0
+    )
+    commands = picking(0.02)
+    motion, _ = batch.advance(commands, 5)
+    assert (motion.points[:, :, 0, 2].max(1) > 0.1).all()

@@ -102,8 +102,9 @@ class BatchState:
             number of the solid, for each future.
         fingers: measured motion of the fingers until now; None = not known.
         stops: stops of the measured fingers until now; None = none were looked for.
-        passed: solids that arms pass through in each future: what measured fingers hold or
-            held, or reached into at the start, until they are apart; empty = none are looked for.
+        passed: solids that arms pass through in each future, until they are apart: what measured
+            fingers hold or held, and what they reached into at the start while they held
+            something; empty = none are looked for.
     """
 
     physics: FloatArray
@@ -354,10 +355,15 @@ class Batch:
             run.passed[number] = held | left
 
     def _reached_into(self, run: _Run, number: int) -> frozenset[int]:
-        """Return the solids that arms hold, or reach into by more than contact lets them."""
+        """Return the solids that arms hold, or reach into while they hold something.
+
+        Free fingers that reach into a solid are about to grip it.
+        """
+        held = frozenset(run.grips[number])
+        if not held:
+            return held
         depths = self._depths(run, number)
-        deep = {item for item, depth_m in depths.items() if depth_m > MAX_CONTACT_DEPTH_M}
-        return frozenset(deep) | frozenset(run.grips[number])
+        return held | {item for item, depth_m in depths.items() if depth_m > MAX_CONTACT_DEPTH_M}
 
     def _depths(self, run: _Run, number: int) -> dict[int, float]:
         """Return how far arms reach into the solids of a future [m], by number of the solid."""
