@@ -75,7 +75,19 @@ def project(
         Pixels are NaN where the point is not in front of the camera, or at an angle to its axis
         where the distortion model would fold it back into the image.
     """
-    T_camera_base = inverse(np.asarray(T_base_camera, dtype=float))
+    return project_from(camera, inverse(np.asarray(T_base_camera, dtype=float)), points)
+
+
+def project_from(
+    camera: CameraModel, T_camera_base: FloatArray, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Project points as `project` does, by the inverse of the camera's pose.
+
+    Args:
+        camera: see `project`.
+        T_camera_base: (4, 4), or (..., 4, 4) that broadcasts with the points.
+        points: (..., 3) [m].
+    """
     local = (T_camera_base[..., :3, :3] @ np.asarray(points, dtype=float)[..., None])[..., 0]
     local = local + T_camera_base[..., :3, 3]
     depth = local[..., 2]

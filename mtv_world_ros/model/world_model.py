@@ -76,12 +76,12 @@ def sample_latents(
         conditioning: conditioning of one chunk (batch 1).
         seed: seed of the noise.
         num_inference_steps: denoising steps a chunk.
-        should_stop: asked between steps.
+        should_stop: asked between steps, and between the transformer's blocks.
         guidance_scale: factor of the difference between the predictions for the conditioning and
             for `conditioning.unguided`; 1 = no guidance, and half the work.
 
     Raises:
-        RolloutPreempted: `should_stop` said so between two steps.
+        RolloutPreempted: `should_stop` said so.
     """
     device = conditioning.control.device
     if transformer.start_image == 'either':
@@ -95,13 +95,17 @@ def sample_latents(
     timesteps: Any = scheduler.timesteps  # the stubs are looser than the schedulers
     sigmas: Any = scheduler.sigmas
     for step, timestep in enumerate(timesteps):
-        if should_stop():
-            raise RolloutPreempted(
-                f'given up after {step} of {num_inference_steps} denoising steps'
-            )
-        out = denoise(transformer, latents, timestep, conditioning, conditioning.text)
+
+        def check(step: int = step) -> None:
+            if should_stop():
+                raise RolloutPreempted(
+                    f'given up after {step} of {num_inference_steps} denoising steps'
+                )
+
+        check()
+        out = denoise(transformer, latents, timestep, conditioning, conditioning.text, check)
         if guidance_scale != 1.0 and (unguided := conditioning.unguided) is not None:
-            away = denoise(transformer, latents, timestep, unguided, unguided.text)
+            away = denoise(transformer, latents, timestep, unguided, unguided.text, check)
             out = away + guidance_scale * (out - away)
         flow = flow_of(transformer, out, latents, sigmas[step].to(device))
         latents = scheduler.step(flow, timestep, latents, return_dict=False)[0]  # type: ignore[arg-type]
@@ -126,6 +130,7 @@ def denoise(
     timestep: Tensor,
     conditioning: Conditioning,
     text: Tensor | None,
+    before_block: Callable[[], None] | None = None,
 ) -> Tensor:
     """Return the transformer's prediction for latents, in float32.
 
@@ -135,6 +140,7 @@ def denoise(
         timestep: timestep of all latents, in [0, 1000].
         conditioning: conditioning in the transformer's number format.
         text: text tokens that replace those of the conditioning; None = keep them.
+        before_block: see the transformer's `forward`.
     """
     return transformer(
         latents.to(transformer.dtype),
@@ -151,6 +157,7 @@ def denoise(
         control_context=conditioning.context,
         control_frame=conditioning.frame,
         control_kept=conditioning.control_kept,
+        before_block=before_block,
     ).float()
 
 

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from mtv_world_ros.cameras.camera import project, unproject
+from mtv_world_ros.cameras.camera import project, project_from, unproject
 from mtv_world_ros.cameras.mask_geometry import centroids
 from mtv_world_ros.core.data_types import BoolArray, CameraModel, FloatArray
-from mtv_world_ros.core.transforms import about_z
+from mtv_world_ros.core.transforms import about_z, inverse
 
 #: directions in the image along which outlines are compared
 _ANGLES = np.linspace(0, 2 * np.pi, 48, endpoint=False)
@@ -332,7 +332,7 @@ class _Outlines:
     """Return the masks of the views that see a part of the object.
 
     Attributes:
-        views: camera and T_base_camera of each.
+        views: camera and T_camera_base of each.
         reach: (N,) extent of the outlines along each direction in each view [px].
     """
 
@@ -345,26 +345,40 @@ class _Outlines:
     ) -> _Outlines:
         seen = [view for view, mask in enumerate(masks) if mask.any()]
         reach = np.concatenate([_reach(_corners(masks[view])) + _PIXEL for view in seen])
-        return cls(tuple((cameras[view], poses[view]) for view in seen), reach)
+        return cls(tuple((cameras[view], inverse(poses[view])) for view in seen), reach)
 
     def residuals(self, corners: FloatArray) -> FloatArray:
         """Return (..., N) how far the outline of points (..., M, 3) reaches beyond them [px]."""
-        found = [_reach(project(camera, pose, corners)[0]) for camera, pose in self.views]
-        return np.nan_to_num(np.concatenate(found, -1) - self.reach, nan=1e3)
+        found = [_reach(project_from(camera, pose, corners)[0]) for camera, pose in self.views]
+        beyond = np.concatenate(found, -1) - self.reach
+        return beyond if np.isfinite(beyond).all() else np.nan_to_num(beyond, nan=1e3)
 
 
 def _least_squares(
     residuals: Callable[[FloatArray], FloatArray], given: FloatArray, **how: Any
 ) -> Any:
-    """Return the least squares from initial parameters (N,); finite differences in one batch."""
+    """Return the least squares from initial parameters (N,); finite differences in one batch.
+
+    Values and differences at one point are computed together: where a point is not taken,
+    differences are computed in vain, which costs less than a second call where it is.
+    """
+    at, rows = np.full(len(given), np.nan), np.zeros((0, 0))
+
+    def evaluate(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the steps (N,) and the residuals (1 + N, M) at a point and beside it."""
+        nonlocal at, rows
+        steps = _DIFFERENCE * np.maximum(1.0, np.abs(numbers))
+        if not np.array_equal(at, numbers):
+            rows = residuals(np.concatenate([numbers[None], numbers + np.diag(steps)]))
+            at = numbers.copy()
+        return steps, rows
 
     def slopes(numbers: FloatArray) -> FloatArray:
-        steps = _DIFFERENCE * np.maximum(1.0, np.abs(numbers))
-        rows = residuals(np.concatenate([numbers[None], numbers + np.diag(steps)]))
-        return ((rows[1:] - rows[0]) / steps[:, None]).T
+        steps, found = evaluate(numbers)
+        return ((found[1:] - found[0]) / steps[:, None]).T
 
     return least_squares(
-        residuals,
+        lambda numbers: evaluate(numbers)[1][0],
         given,
         jac=slopes,  # type: ignore[arg-type]
         max_nfev=_MAX_EVALUATIONS,
@@ -390,9 +404,13 @@ def _in_space(numbers: FloatArray, outline: FloatArray) -> FloatArray:
     yaw, wide, long = (np.zeros_like(x), *turn * 2) if len(turn) == 1 else turn
     along, across = wide * outline[:, 0], long * outline[:, 1]
     cos, sin = np.cos(yaw), np.sin(yaw)
-    flat = (x + cos * along - sin * across, y + sin * along + cos * across)
-    ends = [(*flat, np.broadcast_to(z, flat[0].shape)) for z in (bottom, bottom + height)]
-    return np.concatenate([np.stack(end, -1) for end in ends], -2)
+    count = len(outline)
+    corners = np.empty((*numbers.shape[:-1], 2, count, 3))
+    corners[..., 0] = (x + cos * along - sin * across)[..., None, :]
+    corners[..., 1] = (y + sin * along + cos * across)[..., None, :]
+    corners[..., 0, :, 2] = bottom
+    corners[..., 1, :, 2] = bottom + height
+    return corners.reshape(*numbers.shape[:-1], 2 * count, 3)
 
 
 def _corners(mask: BoolArray) -> FloatArray:

@@ -38,7 +38,8 @@ class RolloutOptions:
             = no contradiction was observed.
         contact: evidence on contact parameters that were fitted in another robot cell.
         on_foreseen: called with each chunk and its estimate once futures tell it, before frames
-            are imagined; the estimate with the frames can only be wider. None = not wanted.
+            are imagined; the estimate with the frames can only be wider. The estimate is None
+            where the frames are needed for one. None = not wanted.
     """
 
     instruction: str = ''
@@ -52,7 +53,7 @@ class RolloutOptions:
     should_stop: Callable[[], bool] = never
     doubt: str = ''
     contact: ContactTrust = ContactTrust()
-    on_foreseen: Callable[[ChunkPlan, SuccessEstimate], None] | None = None
+    on_foreseen: Callable[[ChunkPlan, SuccessEstimate | None], None] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'objects', tuple(self.objects))

@@ -22,7 +22,7 @@ from mtv_world_ros.core.data_types import (
     Observation,
     WorldModelSpec,
 )
-from mtv_world_ros.core.errors import CheckpointError, ConfigError
+from mtv_world_ros.core.errors import CheckpointError, ConfigError, RolloutPreempted
 from mtv_world_ros.model.checkpoint import BUNDLED, Checkpoint
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.plan import ChunkPlan, Plan
@@ -347,9 +347,9 @@ class Pipeline:
         )
         evidence = self.judge.foresee(state.evidence, chunk_start, options)
         if options.on_foreseen is not None:
-            early = self.judge.ahead(evidence, chunk_start, motion, options)
-            if early is not None:
-                options.on_foreseen(plan, early)
+            options.on_foreseen(plan, self.judge.ahead(evidence, chunk_start, motion, options))
+            if options.should_stop():
+                raise RolloutPreempted('stopped before frames were imagined')
         scene = ControlScene(
             motion=motion,
             times=plan.times,

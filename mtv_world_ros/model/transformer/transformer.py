@@ -6,6 +6,7 @@ P latent frames of the history, f h w = token grid, D width; `tokens.py` has the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from diffusers import WanTransformer3DModel
@@ -226,6 +227,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         control_context: Tensor | None = None,
         control_frame: Tensor | None = None,
         control_kept: Tensor | None = None,
+        before_block: Callable[[], None] | None = None,
     ) -> Tensor:
         """Return (B, V, C, F, H, W): flow or clean latents, as `config.prediction` says.
 
@@ -247,6 +249,8 @@ class MultiViewWanTransformer(WanTransformer3DModel):
                 `context_input`.
             control_frame: (B, 1 + T, size) vectors of the control, in models with `frame_input`.
             control_kept: (B,) bool, False = a sample without these two; None = all have them.
+            before_block: called before each block and after the last; what it raises ends the
+                call.
 
         Raises:
             CheckpointError: more views than the model has embeddings for, or text, image or
@@ -293,6 +297,7 @@ class MultiViewWanTransformer(WanTransformer3DModel):
             context,
             by_run(time_proj, grid),
             self.rope(grid.tokens, grid.times),
+            before_block,
         )
         shift, scale = (self.scale_shift_table + temb[:, :1]).chunk(2, dim=1)
         sequence = (self.norm_out(sequence.float()) * (1 + scale) + shift).type_as(sequence)
@@ -323,15 +328,24 @@ class MultiViewWanTransformer(WanTransformer3DModel):
         return temb, proj.unflatten(2, (6, -1)), text, image
 
     def _run_blocks(
-        self, sequence: Tensor, context: Any, time_proj: Tensor, rotary: tuple[Tensor, Tensor]
+        self,
+        sequence: Tensor,
+        context: Any,
+        time_proj: Tensor,
+        rotary: tuple[Tensor, Tensor],
+        before_block: Callable[[], None] | None,
     ) -> Tensor:
         for block in self.blocks:
+            if before_block is not None:
+                before_block()
             if torch.is_grad_enabled() and self.gradient_checkpointing:
                 sequence = checkpoint(
                     block, sequence, context, time_proj, rotary, use_reentrant=False
                 )
             else:
                 sequence = block(sequence, context, time_proj, rotary)
+        if before_block is not None:
+            before_block()
         return sequence
 
 

@@ -323,8 +323,18 @@ class Arms:
         return follows.T @ pin.crba(model, model.createData(), q) @ follows
 
 
-def set_drives(model: Any, drives: Drives, settings: ContactSettings) -> None:
-    """Write drive parameters into a model; fingers get their fitted ones."""
+def set_drives(
+    model: Any, drives: Drives, settings: ContactSettings, rows: np.ndarray, dofs: np.ndarray
+) -> None:
+    """Write drive parameters into a model; fingers get their fitted ones.
+
+    Args:
+        model: model of a scene with these drives.
+        drives: drives of the D degrees of freedom.
+        settings: settings of contact.
+        rows: (D,) indices of the actuators.
+        dofs: (D,) indices of the velocities in qvel.
+    """
     way = drives.travels**2
     count = np.bincount(drives.columns)[drives.columns]
     # of a finger of several joints each has its share
@@ -333,8 +343,6 @@ def set_drives(model: Any, drives: Drives, settings: ContactSettings) -> None:
     stiffness = np.where(fingers, settings.finger_stiffness * share, drives.stiffness)
     damping = np.where(fingers, settings.finger_damping * share, drives.damping)
     armature = np.where(fingers, settings.finger_mass_kg * share, drives.armature)
-    rows = [model.actuator(name).id for name in drives.names]
-    dofs = [model.jnt_dofadr[model.joint(name).id] for name in drives.names]
     model.actuator_gainprm[rows, 0] = stiffness
     model.actuator_biasprm[rows, 1] = -stiffness
     model.actuator_biasprm[rows, 2] = -damping

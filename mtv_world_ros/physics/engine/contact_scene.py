@@ -107,6 +107,7 @@ class CompiledScene:
     arm_dofs: np.ndarray
     solid_qpos: np.ndarray
     solid_dofs: np.ndarray
+    _actuators: np.ndarray = field(repr=False)
     _geoms: tuple[np.ndarray, ...] = field(repr=False)
     _bodies: tuple[int, ...] = field(repr=False)
 
@@ -140,6 +141,7 @@ class CompiledScene:
             arm_dofs=model.jnt_dofadr[driven],
             solid_qpos=model.jnt_qposadr[joints],
             solid_dofs=model.jnt_dofadr[joints],
+            _actuators=np.array([model.actuator(name).id for name in arms.drives.names], int),
             _geoms=tuple(np.flatnonzero(model.geom_bodyid == body) for body in bodies),
             _bodies=tuple(bodies),
         )
@@ -155,7 +157,7 @@ class CompiledScene:
             data: data of a model of this scene, which is written to; None = new data.
         """
         model = copy(self.model)
-        set_drives(model, self.arms.drives, settings)
+        set_drives(model, self.arms.drives, settings, self._actuators, self.arm_dofs)
         is_finger = model.geom_priority > 0
         model.geom_friction[:, 0] = settings.table_friction
         model.geom_friction[is_finger, 0] = settings.grip_friction

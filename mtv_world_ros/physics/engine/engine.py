@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mtv_world_ros.core.data_types import FloatArray
+from mtv_world_ros.core.data_types import BoolArray, FloatArray
 from mtv_world_ros.core.errors import RolloutPreempted
 from mtv_world_ros.physics.arms.arm_response import PERIOD_S
 from mtv_world_ros.physics.arms.arms import Arms, SOLIDS
@@ -212,12 +212,31 @@ class Engine:
         return Batch(self, futures)
 
     def run(
-        self, models: Sequence[Any], data: Sequence[Any], states: FloatArray, controls: FloatArray
+        self, models: list[Any], data: list[Any], states: FloatArray, controls: FloatArray
     ) -> FloatArray:
-        """Simulate K models for S steps from states (K, N); return the states (K, S, N)."""
-        return self._rollout.rollout(
-            models, data, states, controls, chunk_size=1 if self.threads > 1 else None
-        )[0]
+        """Simulate K models for S steps from states (K, N); return the states (K, S, N).
+
+        Args:
+            models: K models of one scene.
+            data: MuJoCo data for each thread.
+            states: (K, N) full physics states.
+            controls: (K, S, D) set points of the drives [rad or m].
+        """
+        states = np.ascontiguousarray(states)
+        controls = np.ascontiguousarray(controls)
+        found = np.empty((len(states), controls.shape[1], states.shape[1]))
+        # the checks of shapes take longer than a few steps of the engine
+        self._rollout.rollout(
+            models,
+            data,
+            states,
+            controls,
+            skip_checks=True,
+            nstep=controls.shape[1],
+            state=found,
+            chunk_size=1 if self.threads > 1 else None,
+        )
+        return found
 
 
 class Batch:
@@ -243,6 +262,7 @@ class Batch:
         free, _ = engine.scene_of(())
         self._planner = CoursePlanner(free, first.settings)
         self._nearby = _Nearby(self._scene, self._models[0])
+        self._constraint_bound = _ConstraintBound(self._models[0])
         self._delays = [round(future.delay_s / STEP_S) for future in futures]
         self._gains = np.stack([model.actuator_gainprm[:, 0] for model in self._models])
 
@@ -299,7 +319,7 @@ class Batch:
         course, arms = self._planner.plan(commands, state.arms)
         courses = [course.late(delay, state.last) for delay in self._delays]
         rows = (len(commands) - 1) // every
-        run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state)
+        run = _Run(self._scene, self.futures, courses, every * SUBSTEPS, state, self._gains)
         fingers = state.fingers
         if self.futures[0].settings.grips_hold:
             grips = GripCourse.of(
@@ -337,8 +357,9 @@ class Batch:
         )
 
     def _advance_row(self, run: _Run, row: int, check: Callable[[], None]) -> None:
+        may_pass = run.may_pass(row)
         passing = [
-            number in run.lost or (run.may_pass(number, row) and self._is_clear(run, number, row))
+            number in run.lost or (may_pass[number] and self._is_clear(run, number, row))
             for number in range(len(self.futures))
         ]
         moving = np.flatnonzero(~np.array(passing))
@@ -384,11 +405,11 @@ class Batch:
         self, run: _Run, row: int, moving: np.ndarray, check: Callable[[], None]
     ) -> None:
         """Compute a row of some futures; those that are crowded in pieces, few at a time."""
-        controls = np.stack([self._controls(run, int(number), row) for number in moving])
+        controls = run.controls[moving, run.steps_of(row)]
         crowded = np.zeros(len(moving), np.bool_)
         for place, number in enumerate(moving):
             check()  # of many futures of many parts the counting takes long itself
-            crowded[place] = self._constraints(run, number) > CROWDED_CONSTRAINTS
+            crowded[place] = self._is_crowded(run, int(number))
         self._compute(run, moving[~crowded], controls[~crowded])
         few = self._engine.threads
         slow, goals = moving[crowded], controls[crowded]
@@ -430,17 +451,16 @@ class Batch:
         mujoco.mj_fwdPosition(model, data)
         return data.nefc
 
-    def _controls(self, run: _Run, number: int, row: int) -> FloatArray:
-        """Return (S, D) numbers of the drives of a future in a row."""
-        course, steps = run.courses[number], run.steps_of(row)
-        targets = course.controls[steps] + course.pushes[steps] / self._gains[number]
-        return targets + self.futures[number].zeros
+    def _is_crowded(self, run: _Run, number: int) -> bool:
+        """Return True if there are more constraints than `CROWDED_CONSTRAINTS`."""
+        bound = self._constraint_bound.of(self._models[number], self._data[0], run.qpos(number))
+        return bound > CROWDED_CONSTRAINTS and self._constraints(run, number) > CROWDED_CONSTRAINTS
 
     def _is_clear(self, run: _Run, number: int, row: int) -> bool:
         """Return True if the arms pass by all solids in a row."""
         last = run.first_step(row + 1)
         steps = [*range(run.first_step(row), last, 2 * SUBSTEPS), last]
-        where = run.courses[number].positions[steps] + self.futures[number].zeros
+        where = run.courses[number].positions[steps] + run.zeros[number]
         return self._nearby.is_clear(run.qpos(number), where)
 
 
@@ -454,8 +474,21 @@ class _Run:
         courses: Sequence[FreeMotion],
         steps: int,
         state: BatchState,
+        gains: FloatArray,
     ) -> None:
         self._scene, self._futures, self.courses, self._steps = scene, futures, courses, steps
+        #: (K, D) offsets of the joint encoders [rad or m]
+        self.zeros = np.stack([future.zeros for future in futures])
+        #: (K, S, D) set points of the drives [rad or m]
+        self.controls = np.stack(
+            [
+                course.controls + course.pushes / gain + zeros
+                for course, gain, zeros in zip(courses, gains, self.zeros, strict=True)
+            ]
+        )
+        #: (K, T + 1, D) free motion of the arms at each row
+        self._planned = np.stack([course.positions[::steps] for course in courses])
+        self._planned_speeds = np.stack([course.velocities[::steps] for course in courses])
         self.physics, self.still = state.physics.copy(), state.still.copy()
         self.lost, self.computed = dict(state.lost), 0
         self._spent = np.zeros(len(futures), np.int64)
@@ -464,7 +497,14 @@ class _Run:
         self._grip_course: GripCourse | None = None
         self.stops = None if state.stops is None else state.stops.copy()
         self._was_stopped = np.zeros(0, np.bool_)
-        self._rows = [self._read()]
+        #: columns of a state: places, speeds and turn speeds of the solids
+        at, dofs = 1 + scene.solid_qpos[:, None], 1 + scene.model.nq + scene.solid_dofs[:, None]
+        self._places = (at + np.arange(3)).ravel()
+        self._ways, self._turns = ((dofs + k + np.arange(3)).ravel() for k in (0, 3))
+        self._arms = 1 + scene.arm_qpos
+        self._arm_speeds = 1 + scene.model.nq + scene.arm_dofs
+        #: states (K, N) at each row
+        self._rows = [self.physics.copy()]
 
     def grip(self, course: GripCourse) -> None:
         """Hold the solids that the measured fingers of a course hold from its first row on."""
@@ -473,7 +513,7 @@ class _Run:
             self.stops = StopState.begin(len(self._futures), len(course.openings))
         self._was_stopped = self.stops.is_stopped.copy()
         self._hold(0)
-        self._rows = [self._read()]
+        self._rows = [self.physics.copy()]
 
     def _hold(self, row: int) -> None:
         """Move the solids that are held at a row with their grippers."""
@@ -533,27 +573,27 @@ class _Run:
     def qpos(self, number: int) -> FloatArray:
         return self.physics[number, 1 : 1 + self._scene.model.nq]
 
-    def may_pass(self, number: int, row: int) -> bool:
-        """Return True if all solids are at rest and the arms move as in free air."""
-        if self.still[number] < _SLEEP.num_still_rows or self.grips[number]:
-            return False
-        course, step, scene = self.courses[number], self.first_step(row), self._scene
-        off = self.qpos(number)[scene.arm_qpos] - self._futures[number].zeros
-        speeds = self.physics[number, 1 + scene.model.nq :][scene.arm_dofs]
-        return bool(
-            (np.abs(off - course.positions[step]) < _SLEEP.tracking_tolerance).all()
-            and (np.abs(speeds - course.velocities[step]) < _SLEEP.tracking_speed_tolerance).all()
+    def may_pass(self, row: int) -> BoolArray:
+        """Return (K,) True where all solids are at rest and the arms move as in free air."""
+        off = self.physics[:, self._arms] - self.zeros - self._planned[:, row]
+        speeds = self.physics[:, self._arm_speeds] - self._planned_speeds[:, row]
+        return (
+            (self.still >= _SLEEP.num_still_rows)
+            & np.array([not held for held in self.grips])
+            & (np.abs(off) < _SLEEP.tracking_tolerance).all(-1)
+            & (np.abs(speeds) < _SLEEP.tracking_speed_tolerance).all(-1)
         )
 
     def take(self, moving: np.ndarray, states: FloatArray) -> None:
         """Take what was computed; futures that no object can have are lost."""
         self.computed += states.shape[0] * states.shape[1]
-        for number, last in zip(map(int, moving), states[:, -1], strict=True):
-            why = self._implausible(last)
-            if why:
-                self.lost[number] = why
-            else:
-                self.physics[number] = last
+        last = states[:, -1]
+        implausible = self._implausible(last)
+        if implausible:
+            self.lost |= {int(moving[place]): why for place, why in implausible.items()}
+            kept = np.array([place not in implausible for place in range(len(moving))])
+            moving, last = moving[kept], last[kept]
+        self.physics[moving] = last
 
     def charge(self, number: int, constraints: int, steps: int) -> None:
         """Count what steps of a crowded future cost; it is lost where that is too much."""
@@ -569,64 +609,81 @@ class _Run:
 
     def finish_row(self, row: int, moving: np.ndarray) -> None:
         """Move the arms of futures that were not computed, and keep where all is."""
-        scene, step = self._scene, self.first_step(row + 1)
-        nq, moved = scene.model.nq, set(map(int, moving))
-        for number, physics in enumerate(self.physics):
-            if number in self.lost:
-                continue
-            if number not in moved:
-                course = self.courses[number]
-                physics[1 + scene.arm_qpos] = course.positions[step] + self._futures[number].zeros
-                physics[1 + nq + scene.arm_dofs] = course.velocities[step]
-            elif self._at_rest(physics):
-                self.still[number] += 1
-            else:
-                self.still[number] = 0
+        counts = np.array([number not in self.lost for number in range(len(self.physics))])
+        moved = np.zeros(len(counts), np.bool_)
+        moved[moving] = True
+        passed = np.flatnonzero(counts & ~moved)
+        at = self._planned[passed, row + 1] + self.zeros[passed]
+        self.physics[passed[:, None], self._arms] = at
+        self.physics[passed[:, None], self._arm_speeds] = self._planned_speeds[passed, row + 1]
+        then = np.where(self._at_rest(self.physics), self.still + 1, 0)
+        self.still = np.where(counts & moved, then, self.still)
         self._hold(row + 1)
-        self._rows.append(self._read())
+        self._rows.append(self.physics.copy())
 
     def motion(self) -> BatchMotion:
         """Return the motion of all computed rows."""
-        points, rotations, joints = (np.stack(rows, 1) for rows in zip(*self._rows, strict=True))
-        return BatchMotion(points=points, rotations=rotations, joints=joints, steps=self.computed)
-
-    def _read(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the points (K, O, 3), rotations (K, O, 3, 3) and joints (K, J) now."""
         scene, drives = self._scene, self._scene.arms.drives
-        qpos = self.physics[:, 1 : 1 + scene.model.nq]
+        qpos = np.stack(self._rows, 1)[..., 1 : 1 + scene.model.nq]
         at = scene.solid_qpos[:, None]
-        turns = _matrices(qpos[:, at + np.arange(3, 7)])
-        zeros = np.stack([future.zeros for future in self._futures])
-        driven = qpos[:, scene.arm_qpos] - zeros
-        joints = drives.joints(driven, len(scene.arms.robot.joint_names))
-        return qpos[:, at + np.arange(3)], turns, joints
-
-    def _speeds(self, physics: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (O, 3) speeds of ways and of turns of the solids."""
-        scene = self._scene
-        rows = physics[1 + scene.model.nq :][scene.solid_dofs[:, None] + np.arange(6)]
-        return rows[:, :3], rows[:, 3:]
-
-    def _at_rest(self, physics: FloatArray) -> bool:
-        ways, turns = self._speeds(physics)
-        return bool(
-            (np.abs(ways) < _SLEEP.max_linear_speed_m_s).all()
-            and (np.abs(turns) < _SLEEP.max_angular_speed_rad_s).all()
+        driven = qpos[..., scene.arm_qpos] - self.zeros[:, None]
+        return BatchMotion(
+            points=qpos[..., at + np.arange(3)],
+            rotations=_matrices(qpos[..., at + np.arange(3, 7)]),
+            joints=drives.joints(driven, len(scene.arms.robot.joint_names)),
+            steps=self.computed,
         )
 
-    def _implausible(self, physics: FloatArray) -> str:
-        """Return the reason why the simulation diverged; empty if it did not."""
-        if not np.isfinite(physics).all():
-            return 'the engine diverged'
-        ways, turns = self._speeds(physics)
-        places = physics[1 + self._scene.solid_qpos[:, None] + np.arange(3)]
-        if (np.abs(places) > _LIMITS.max_distance_m).any():
-            return 'an object left the table for good'
-        if (np.abs(ways) > _LIMITS.max_linear_speed_m_s).any() or (
-            np.abs(turns) > _LIMITS.max_angular_speed_rad_s
-        ).any():
-            return 'an object became faster than anything on a table'
-        return ''
+    def _at_rest(self, physics: FloatArray) -> BoolArray:
+        """Return (K,) True where all solids of states (K, N) are at rest."""
+        return np.asarray(
+            (np.abs(physics[:, self._ways]) < _SLEEP.max_linear_speed_m_s).all(-1)
+            & (np.abs(physics[:, self._turns]) < _SLEEP.max_angular_speed_rad_s).all(-1)
+        )
+
+    def _implausible(self, physics: FloatArray) -> dict[int, str]:
+        """Return the reason why each simulation diverged, by the row of states (K, N)."""
+        left = (np.abs(physics[:, self._places]) > _LIMITS.max_distance_m).any(-1)
+        fast = (np.abs(physics[:, self._ways]) > _LIMITS.max_linear_speed_m_s).any(-1)
+        fast |= (np.abs(physics[:, self._turns]) > _LIMITS.max_angular_speed_rad_s).any(-1)
+        checks = (
+            (~np.isfinite(physics).all(-1), 'the engine diverged'),
+            (left, 'an object left the table for good'),
+            (fast, 'an object became faster than anything on a table'),
+        )
+        reasons: dict[int, str] = {}
+        for is_bad, why in checks:
+            for place in map(int, np.flatnonzero(is_bad)):
+                reasons.setdefault(place, why)
+        return reasons
+
+
+class _ConstraintBound:
+    """Upper bound of the number of constraints, from contacts alone.
+
+    The constraints themselves are not computed, which would take three times as long.
+
+    Args:
+        model: model of a scene; those of its futures have the same numbers of parts.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._each = int(model.geom_condim.max())
+        # limits of joints at both ends, welds, dry friction
+        self._fixed = 2 * model.njnt + 6 * model.neq + model.nv
+
+    def of(self, model: Any, data: Any, qpos: FloatArray) -> int:
+        """Return the bound for a future.
+
+        Args:
+            model: model of the future.
+            data: MuJoCo data, which is written to.
+            qpos: positions of the joints and the solids.
+        """
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        return self._fixed + self._each * data.ncon
 
 
 class _Nearby:

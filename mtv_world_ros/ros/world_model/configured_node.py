@@ -166,6 +166,7 @@ class ConfiguredNode:
         self._fidelity = LiveFidelity(node, pipeline, self)
         self._worker.doubt = lambda: self._fidelity.watch.doubt
         self._worker.contact = self._fidelity.trust
+        self._fidelity.wait_for_verdict = self._worker.wait_for_verdict
         undo.callback(self._fidelity.close)
         self._publisher = PredictionPublisher(node, self._spec, self._robot.joint_names, self)
         self._arrived: deque[_Arrived] = deque()

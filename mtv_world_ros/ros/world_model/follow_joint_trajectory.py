@@ -140,7 +140,7 @@ class FollowJointTrajectory:
             return 'abort', code, f'{text}; {verdict}'
         if ended.state == 'done':
             least = self._events.settings().least_goal_success
-            probability = ended.last.prediction.success.probability if ended.last else float('nan')
+            probability = ended.success.probability if ended.success else float('nan')
             if least and not probability >= least:
                 text = f"'least_goal_success' asks for {least:g}"
                 return 'abort', 'GOAL_TOLERANCE_VIOLATED', f'{verdict}; {text}'
@@ -222,12 +222,13 @@ def _code(reason: Reason | None) -> str:
 
 def _verdict(ended: Ended) -> str:
     """Return the state of the plan of a goal."""
-    if ended.last is None:
-        return 'nothing was imagined'
-    prediction = ended.last.prediction
-    success = prediction.success
+    success, last = ended.success, ended.last
+    known = 'nothing was imagined'
+    if last is not None:
+        known = f'{ended.num_chunks} of {last.prediction.num_chunks} chunks imagined'
+    if success is None:
+        return known
     reasons = '; '.join(success.reasons)
-    known = f'{ended.num_chunks} of {prediction.num_chunks} chunks imagined'
     if isnan(success.probability):
         return f'{known}; {reasons}'
     low, high = success.interval

@@ -48,6 +48,8 @@ MAX_KEPT = 1000
 NOT_KEPT = "the evidence ends with the node: set the parameter 'place' to keep it"
 #: a real frame stands for an imagined one if it is at most this share of a period away
 MAX_OFFSET = 0.3
+#: a comparison waits for the verdict of a new plan up to this [s]
+MAX_DELAY_S = 1.0
 
 
 @dataclass(slots=True, eq=False)  # arrays have no truth value: one is only itself
@@ -108,6 +110,7 @@ class LiveFidelity:
 
     Attributes:
         watch: tests whether executed plans ended as the fitted contact parameters foresee.
+        wait_for_verdict: waits until no verdict is computed, up to a time [s].
 
     Args:
         node: owner of the publisher.
@@ -122,6 +125,7 @@ class LiveFidelity:
         events: NodeEvents,
     ) -> None:
         self.watch = PhysicsWatch()
+        self.wait_for_verdict: Callable[[float], None] = lambda _: None
         self._place = ''
         self._cells: dict[str, _Cell] = {}
         self._cells_lock = Lock()
@@ -239,6 +243,7 @@ class LiveFidelity:
                 for view, message in images:
                     self._keep(view, message)
                 while (expected := self._next_due()) is not None:
+                    self.wait_for_verdict(MAX_DELAY_S)
                     self._score(expected)
             except Exception as error:  # the node outlives whatever a segmenter raises
                 self._results.append(error)

@@ -34,7 +34,7 @@ _WINDOW = 50
 _WARN_S = 5.0
 #: reports that are kept for a subscriber that is busy: each plan has one end
 REPORTS_KEPT = 1000
-#: rollouts ended in a row without a chunk that are worth a warning
+#: rollouts ended in a row without a verdict that are worth a warning
 _STARVED = 5
 #: reasons that mean something is broken here and not in what was sent
 _ERRORS = (Reason.OUT_OF_MEMORY, Reason.WORKER_STUCK, Reason.INTERNAL_ERROR)
@@ -168,7 +168,7 @@ class Reporter:
 
     def ended(self, ended: Ended) -> None:
         """Count and report the end of a rollout."""
-        self._tally.end(ended.state, ended.num_chunks)
+        self._tally.end(ended.state, is_judged=ended.success is not None)
         if ended.trace:
             self._node.get_logger().error(ended.trace)
         if ended.reason is not None:
@@ -221,10 +221,10 @@ class Tally:
         self._rejected[error.reason] += 1
         self._last = (now_s, error.reason, str(error))
 
-    def end(self, state: str, num_chunks: int) -> None:
-        """Count the end of a rollout."""
+    def end(self, state: str, *, is_judged: bool) -> None:
+        """Count the end of a rollout, and whether it had an estimate."""
         self.counts[f'rollouts_{state}'] += 1
-        starved = state == 'preempted' and num_chunks == 0
+        starved = state == 'preempted' and not is_judged
         self._fruitless = self._fruitless + 1 if starved else 0
 
     def add_seconds(self, seconds: Mapping[str, float]) -> None:
@@ -254,8 +254,8 @@ class Tally:
             )
         if self._fruitless >= _STARVED:
             texts.append(
-                f'the last {self._fruitless} rollouts were pre-empted before their first chunk: '
-                'trajectories arrive faster than the model predicts'
+                f'the last {self._fruitless} rollouts were pre-empted before their first verdict: '
+                'trajectories arrive faster than they are judged'
             )
         texts += [', '.join(missing)] if missing else []
         return (level, ' | '.join(texts)) if texts else (DiagnosticStatus.OK, READY)
@@ -330,8 +330,8 @@ def _chunk_identity(chunk: Chunk) -> dict[str, object]:
 def _ended_values(ended: Ended) -> dict[str, object]:
     """Keys and values of a rollout's end, with the last estimate of the plan if there is one."""
     values = {**_request_values(ended.request), 'num_chunks': ended.num_chunks}
-    if ended.last is not None:
-        values |= _success_values(ended.last.prediction.success)
+    if ended.success is not None:
+        values |= _success_values(ended.success)
     if ended.reason is not None:
         values['reason'] = ended.reason.value
     if ended.text:

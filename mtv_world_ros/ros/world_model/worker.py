@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from math import inf
 from threading import Condition, current_thread, Thread
 import time
 import traceback
@@ -119,6 +120,7 @@ class Ended:
         state: `done`, `preempted`, `rejected`, `failed` or `reset`.
         num_chunks: number of predicted chunks.
         last: last predicted chunk; None = no chunk was predicted.
+        foreseen: last estimate before frames were imagined; None = futures told none.
         reason: code of the reason why the plan was rejected or failed.
         text: the reason in words, also of a pre-emption by anything but a newer plan.
         trace: traceback of an unexpected error.
@@ -128,9 +130,18 @@ class Ended:
     state: str
     num_chunks: int
     last: Chunk | None = None
+    foreseen: Foreseen | None = None
     reason: Reason | None = None
     text: str = ''
     trace: str = ''
+
+    @property
+    def success(self) -> SuccessEstimate | None:
+        """Last estimate of the plan; None = none was given."""
+        last, foreseen = self.last, self.foreseen
+        if foreseen is not None and (last is None or foreseen.chunk > last.prediction.chunk):
+            return foreseen.success
+        return None if last is None else last.prediction.success
 
 
 #: what takers of results are given; `Foreseen` is reported alone
@@ -161,7 +172,14 @@ class RolloutWorker:
         self._pending: Request | None = None
         self._running: Request | None = None
         self._known: list[Chunk] = []
+        #: futures of the running plan's first chunk are computed
+        self._is_foreseeing = False
+        #: what futures of the running plan told last
+        self._foreseen: Foreseen | None = None
         self._is_starved = False
+        #: when the last chunk was ready, of `time.monotonic`, and how long its frames last [s]
+        self._pictured_s = -inf
+        self._chunk_s = pipeline.spec.num_frames / pipeline.spec.fps
         self._between: deque[Callable[[], None]] = deque()
         self._abandoned = False
         self._closing = False
@@ -196,6 +214,7 @@ class RolloutWorker:
                 self._put(self._ended(self._running, 'failed', Reason.WORKER_STUCK, text))
             self._running, self._abandoned, self._beat_s = None, False, None
             self._episode, self._last, self._known = None, None, []
+            self._is_foreseeing, self._foreseen = False, None
             self._observed = ObservedEpisode(self._pipeline)
             self._thread = self._new_thread()
             self._thread.start()
@@ -225,9 +244,12 @@ class RolloutWorker:
     def submit(self, request: Request) -> None:
         """Start a request; it pre-empts a running one and replaces a waiting one.
 
-        From when a rollout was pre-empted without a chunk until one ends with none waiting, each
-        completes its first chunk: of plans that come faster than chunks, as many as there is time
-        for get estimates.
+        A running one first gets the verdict of its first chunk's futures: of plans that come
+        faster, as many as there is time for get verdicts. Its frames are skipped for the newer
+        one, unless no chunk was imagined for as long as a chunk lasts.
+
+        Where futures tell no verdict, frames do: from when a rollout was pre-empted without one
+        until one ends with none waiting, each completes its first chunk.
         """
         with self._changed:
             if self._pending is not None:
@@ -298,6 +320,15 @@ class RolloutWorker:
                 self._put(Ended(request=pending, state='preempted', num_chunks=0, text=text))
                 self._pending = None
 
+    def wait_for_verdict(self, longest_s: float) -> None:
+        """Wait until no futures are computed, which other work would delay.
+
+        Args:
+            longest_s: longest time to wait [s].
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: not self._is_foreseeing or self._closing, longest_s)
+
     def take(self) -> list[Result | Foreseen]:
         """Return the results since the last call, in order."""
         with self._changed:
@@ -325,8 +356,9 @@ class RolloutWorker:
                     self._put(ended)
                 is_preempted = ended.state == 'preempted' and not self._abandoned
                 are_fast = self._is_starved and self._pending is not None
-                self._is_starved = are_fast or (is_preempted and not ended.num_chunks)
+                self._is_starved = are_fast or (is_preempted and ended.success is None)
                 self._running, self._abandoned = None, False
+                self._end_foreseeing()
 
     def _next(self) -> Request | None:
         while True:
@@ -343,7 +375,7 @@ class RolloutWorker:
                     job = self._catch_up
                 if job is None:
                     self._running, self._pending = self._pending, None
-                    self._known = []
+                    self._known, self._foreseen = [], None
                     return self._running
             job()
 
@@ -364,8 +396,24 @@ class RolloutWorker:
             if self._is_given_up:
                 return True
             self._beat_s = time.monotonic()
-            is_replaced = self._pending is not None and (self._known or not self._is_starved)
-            return self._closing or self._abandoned or bool(is_replaced)
+            is_replaced = self._pending is not None and self._gives_way()
+            return self._closing or self._abandoned or is_replaced
+
+    def _gives_way(self) -> bool:
+        """Return whether the running plan is left for a newer one now."""
+        if self._known:
+            return True
+        if self._is_foreseeing:
+            return False
+        if self._foreseen is None:
+            return not self._is_starved
+        # an imagined episode goes on from its frames
+        are_wanted = self._running is not None and self._running.imagine
+        return not are_wanted and time.monotonic() - self._pictured_s < self._chunk_s
+
+    def _end_foreseeing(self) -> None:
+        self._is_foreseeing = False
+        self._changed.notify_all()
 
     def _roll_out(self, request: Request) -> Ended:
         try:
@@ -396,12 +444,15 @@ class RolloutWorker:
             state=state,
             num_chunks=len(known),
             last=last,
+            foreseen=self._foreseen,
             reason=reason,
             text=text,
         )
 
     def _imagine(self, request: Request) -> None:
         """Imagine the chunks of a request and hand each on."""
+        with self._changed:
+            self._is_foreseeing = True
         scene, episode = self._begin(request, self._options(request))
         # rollouts before this one may have moved the robot in imagination
         plan = request.plan.after(episode.observation)
@@ -420,6 +471,7 @@ class RolloutWorker:
                     self._episode = episode
                     self._last = replace(scene, observation=episode.observation)
                 self._known.append(chunk)
+                self._pictured_s = chunk.ready_s
                 self._put(chunk)
 
     def _options(self, request: Request) -> RolloutOptions:
@@ -439,8 +491,15 @@ class RolloutWorker:
             on_foreseen=partial(self._put_foreseen, request),
         )
 
-    def _put_foreseen(self, request: Request, plan: ChunkPlan, success: SuccessEstimate) -> None:
-        """Hand on the estimate of a chunk whose frames are not imagined yet."""
+    def _put_foreseen(
+        self, request: Request, plan: ChunkPlan, success: SuccessEstimate | None
+    ) -> None:
+        """Hand on the estimate of a chunk whose frames are not imagined yet, if there is one."""
+        if success is None:
+            with self._changed:
+                if not self._is_given_up:
+                    self._end_foreseeing()
+            return
         found = Foreseen(
             request=request,
             chunk=plan.chunk,
@@ -450,6 +509,8 @@ class RolloutWorker:
         )
         with self._changed:
             if not (self._abandoned or self._closing or self._is_given_up):
+                self._foreseen = found
+                self._end_foreseeing()
                 self._put(found)
 
     def _begin(self, request: Request, options: RolloutOptions) -> tuple[SensedScene, Rollout]:
