@@ -431,12 +431,15 @@ def fill(parts: Sequence[FloatArray], camera: CameraModel) -> NDArray[np.uint8]:
     """
     images = np.zeros((len(parts[0]), camera.height, camera.width), np.uint8)
     size = np.array([camera.width, camera.height])
-    for part in parts:
-        with np.errstate(invalid='ignore'):
-            low, high = part.min(axis=1), part.max(axis=1)
-            seen = ((high > -1) & (low < size)).all(axis=1)  # NaN is not seen
-        fixed = np.nan_to_num(part).clip(-_FAR_PX, _FAR_PX) * 2**_SHIFT_BITS
-        fixed = np.rint(fixed).astype(np.int32)
-        for row in np.flatnonzero(seen):
-            cv2.fillConvexPoly(images[row], cv2.convexHull(fixed[row]), 1, shift=_SHIFT_BITS)
+    corners = np.concatenate(parts, axis=1)
+    ends = np.cumsum([part.shape[1] for part in parts])
+    starts = np.concatenate([[0], ends[:-1]])
+    with np.errstate(invalid='ignore'):
+        low, high = (f.reduceat(corners, starts, axis=1) for f in (np.minimum, np.maximum))
+        seen = ((high > -1) & (low < size)).all(axis=-1)  # NaN is not seen
+    fixed = np.nan_to_num(corners).clip(-_FAR_PX, _FAR_PX) * 2**_SHIFT_BITS
+    fixed = np.rint(fixed).astype(np.int32)
+    for row, part in np.argwhere(seen):
+        hull = cv2.convexHull(fixed[row, starts[part] : ends[part]])
+        cv2.fillConvexPoly(images[row], hull, 1, shift=_SHIFT_BITS)
     return images

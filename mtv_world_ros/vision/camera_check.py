@@ -191,14 +191,20 @@ class CameraChecker:
         """
         if not self._shape.is_known:
             return (False,) * len(observation.cameras)
+        links = _links(self._robot, self._shape.parts, observation.positions)
         return tuple(
-            self._is_met(camera, frame, observation.positions)
+            self._is_met(camera, frame, observation.positions, links)
             for camera, frame in zip(observation.cameras, observation.frames, strict=True)
         )
 
-    def _is_met(self, camera: CameraModel, frame: ByteArray, positions: FloatArray) -> bool:
+    def _is_met(
+        self,
+        camera: CameraModel,
+        frame: ByteArray,
+        positions: FloatArray,
+        links: Sequence[FloatArray],
+    ) -> bool:
         camera = _checked_size(camera)
-        links = _links(self._robot, self._shape.parts, positions)
         pose = camera_poses(camera, self._robot, positions[None])[0]
         outline = _outline(camera, links, pose)
         is_in_view = len(outline.pixels) >= _CHECK.min_points

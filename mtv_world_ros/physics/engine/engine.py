@@ -261,6 +261,8 @@ class Batch:
         ]
         free, _ = engine.scene_of(())
         self._planner = CoursePlanner(free, first.settings)
+        #: solids that arms pass through in the model of each future
+        self._lets_pass = [frozenset[int]() for _ in futures]
         self._nearby = _Nearby(self._scene, self._models[0])
         self._constraint_bound = _ConstraintBound(self._models[0])
         self._delays = [round(future.delay_s / STEP_S) for future in futures]
@@ -364,7 +366,7 @@ class Batch:
         ]
         moving = np.flatnonzero(~np.array(passing))
         for number in map(int, moving):
-            self._scene.let_pass(self._models[number], run.passed[number])
+            self._let_pass(number, run.passed[number])
         if len(moving):
             self._compute_row(run, row, moving, check)
         run.finish_row(row, moving)
@@ -374,6 +376,12 @@ class Batch:
             if left and number not in run.lost:
                 left &= self._depths(run, number).keys()
             run.passed[number] = held | left
+
+    def _let_pass(self, number: int, solids: frozenset[int]) -> None:
+        """Let arms pass through these solids in a future; all others are touched."""
+        if self._lets_pass[number] != solids:
+            self._scene.let_pass(self._models[number], solids)
+            self._lets_pass[number] = solids
 
     def _reached_into(self, run: _Run, number: int) -> frozenset[int]:
         """Return the solids that arms hold, or reach into while they hold something.
@@ -389,7 +397,7 @@ class Batch:
     def _depths(self, run: _Run, number: int) -> dict[int, float]:
         """Return how far arms reach into the solids of a future [m], by number of the solid."""
         model, data = self._models[number], self._data[0]
-        self._scene.let_pass(model, ())
+        self._let_pass(number, frozenset())
         data.qpos[:] = run.qpos(number)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
