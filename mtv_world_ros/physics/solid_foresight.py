@@ -160,16 +160,18 @@ class SolidForesight:
         """Find objects that may be partly hidden; see `ObjectMotionModel.find_again`."""
         points = locate_all(cameras, poses, centroids(masks))
         floor = whole.foresight.settings.table_m
-        solids = [
-            solid and find_solid(solid, masks[:, item], points[item], cameras, poses, floor)
-            for item, solid in enumerate(whole.solids)
-        ]
+        solids: list[Solid | None] = [None] * len(whole.solids)
         is_kept = np.zeros(len(solids), np.bool_)
-        for item, one in enumerate(kept):
-            solid = one and whole.solids[item]
-            before = one and solid and _solid_then(one, solid, floor)
+        for item, solid in enumerate(whole.solids):
+            if solid is None:
+                continue
+            one = kept[item] if kept else None
+            before = one and _solid_then(one, solid, floor)
             if before is not None:
                 solids[item], is_kept[item] = before, True
+            else:
+                given = masks[:, item], points[item], cameras, poses, floor
+                solids[item] = find_solid(solid, *given)
         for item in map(int, np.flatnonzero(held)):
             solid = solids[item]
             solids[item] = solid and replace(solid, is_held=True)

@@ -212,19 +212,24 @@ class Engine:
         return Batch(self, futures)
 
     def run(
-        self, models: list[Any], data: list[Any], states: FloatArray, controls: FloatArray
-    ) -> FloatArray:
-        """Simulate K models for S steps from states (K, N); return the states (K, S, N).
+        self,
+        models: list[Any],
+        data: list[Any],
+        states: FloatArray,
+        controls: FloatArray,
+        found: FloatArray,
+    ) -> None:
+        """Simulate K models for S steps from states (K, N).
 
         Args:
             models: K models of one scene.
             data: MuJoCo data for each thread.
             states: (K, N) full physics states.
             controls: (K, S, D) set points of the drives [rad or m].
+            found: (K, S, N) contiguous, takes the states after each step.
         """
         states = np.ascontiguousarray(states)
         controls = np.ascontiguousarray(controls)
-        found = np.empty((len(states), controls.shape[1], states.shape[1]))
         # the checks of shapes take longer than a few steps of the engine
         self._rollout.rollout(
             models,
@@ -236,7 +241,6 @@ class Engine:
             state=found,
             chunk_size=1 if self.threads > 1 else None,
         )
-        return found
 
 
 class Batch:
@@ -446,8 +450,9 @@ class Batch:
         if not len(moving):
             return
         models = [self._models[number] for number in moving]
-        states = self._engine.run(models, self._data, run.physics[moving], controls)
-        run.take(moving, states)
+        found = run.found_states(len(moving), controls.shape[1])
+        self._engine.run(models, self._data, run.physics[moving], controls, found)
+        run.take(moving, found)
 
     def _constraints(self, run: _Run, number: int) -> int:
         """Return the number of constraints, of contacts most, where a future is.
@@ -513,6 +518,7 @@ class _Run:
         self._arm_speeds = 1 + scene.model.nq + scene.arm_dofs
         #: states (K, N) at each row
         self._rows = [self.physics.copy()]
+        self._found = np.empty(self.physics.size * steps)
 
     def grip(self, course: GripCourse) -> None:
         """Hold the solids that the measured fingers of a course hold from its first row on."""
@@ -591,6 +597,11 @@ class _Run:
             & (np.abs(off) < _SLEEP.tracking_tolerance).all(-1)
             & (np.abs(speeds) < _SLEEP.tracking_speed_tolerance).all(-1)
         )
+
+    def found_states(self, count: int, steps: int) -> FloatArray:
+        """Return an array (count, steps, N) for computed states, which the next call reuses."""
+        size = count * steps * self.physics.shape[1]
+        return self._found[:size].reshape(count, steps, -1)
 
     def take(self, moving: np.ndarray, states: FloatArray) -> None:
         """Take what was computed; futures that no object can have are lost."""

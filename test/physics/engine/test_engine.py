@@ -160,9 +160,9 @@ def cluttered(towers: int) -> list[Solid]:
 def test_crowded_futures_are_computed_in_pieces_that_depend_on_nothing_else(lift, monkeypatch):
     commands, asked, run = picking(1.0), [], Engine.run
 
-    def counted(self, models, data, states, controls):
+    def counted(self, models, data, states, controls, out):
         asked.append((len(models), controls.shape[1]))
-        return run(self, models, data, states, controls)
+        run(self, models, data, states, controls, out)
 
     monkeypatch.setattr(Engine, 'run', counted)
     monkeypatch.setattr(engine_module, 'CROWDED_CONSTRAINTS', 40)
