@@ -587,9 +587,7 @@ def test_an_engine_that_diverges_is_named_and_there_is_no_verdict(
     recording, world_model, monkeypatch
 ):
     foresight = load_foresight(share_path('resource', 'checkpoint', 'object_motion'), YAM)
-    monkeypatch.setattr(foresight.engine, 'run', lambda m, d, states, controls: np.full(
-        (len(states), controls.shape[1], states.shape[1]), np.nan
-    ))  # fmt: skip
+    monkeypatch.setattr(foresight.engine, 'run', lambda *given: given[-1].fill(np.nan))
     chunks = imagine(with_motion(world_model, foresight), recording, 3.2)
     last = chunks[-1].success
     assert np.isnan(last.probability) and 'foreseen futures are implausible' in last.reasons[0]
