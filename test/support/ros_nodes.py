@@ -51,7 +51,12 @@ PACKAGES = filter(
         str(Path(sys.prefix) / 'interfaces'),
     ),
 )
-ENVIRONMENT = {**os.environ, 'PYTHONPATH': os.pathsep.join(PACKAGES), 'OMP_NUM_THREADS': '1'}
+ENVIRONMENT = {
+    **os.environ,
+    'PYTHONPATH': os.pathsep.join(PACKAGES),
+    'OMP_NUM_THREADS': '1',
+    'PYTHONFAULTHANDLER': '1',  # a crash says where, in the node's output
+}
 FAKE = Path(__file__).with_name('fake_world_model.py')
 FAKE_POLICY = Path(__file__).with_name('fake_policy.py')
 VIEWS = ('low', 'high')

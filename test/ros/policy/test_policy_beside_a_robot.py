@@ -78,4 +78,4 @@ def test_an_imagined_episode_starts_from_what_the_cameras_show(tmp_path, ros):
     finally:
         client.close()
         for process in (policy, world):
-            assert process.stop() == 0
+            assert process.stop() == 0, process.output()

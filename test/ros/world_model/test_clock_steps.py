@@ -62,6 +62,6 @@ def test_plans_go_on_after_the_clock_was_set_back_and_ahead(tmp_path, ros):
         assert chunk['observation_stamp_ns'] == str(stamp_ns)
     finally:
         client.close()
-        assert node.stop() == 0
+        assert node.stop() == 0, node.output()
     assert 'the system clock was set by +3600' in node.output()
     assert 'the system clock was set by -3690' in node.output()

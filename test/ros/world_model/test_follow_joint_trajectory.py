@@ -22,7 +22,7 @@ needs_control_msgs = pytest.mark.control_msgs
 def node(tmp_path_factory, ros):
     node = ros.start_node(tmp_path_factory.mktemp('node'), 'pace:=burst')
     yield node
-    assert node.stop() == 0
+    assert node.stop() == 0, node.output()
     assert 'Traceback' not in node.output(), node.output()
 
 

@@ -218,7 +218,7 @@ def test_ends_cleanly_in_the_middle_of_a_rollout(tmp_path, new_client, ros, numb
         client.connect_inputs(ros.INPUTS)
         client.send_scene()
         client.send_trajectory_and_wait_until_it_runs()
-        assert process.stop(number) == 0
+        assert process.stop(number) == 0, process.output()
         assert 'Traceback' not in process.output()
     finally:  # a node that is left would answer other tests
         process.process.kill()
