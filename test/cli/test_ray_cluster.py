@@ -38,7 +38,7 @@ COMMANDS = {
         ['evaluate', 'bundled', 'DATA', '--split', 'all', '--actions', 'true', '--no-ceiling',
          '--no-report', *MODEL],
         'episodes/*.json',
-        4,
+        6,
     ),
     'imagine': (
         ['imagine', '--policy', 'recorded', '--episodes', 'DATA', '--count', '12',
@@ -72,9 +72,9 @@ def cluster() -> Iterator[Any]:
 
 @pytest.fixture(scope='module')
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four recorded episodes."""
+    """Six recorded episodes."""
     folder = tmp_path_factory.mktemp('data')
-    for index in range(4):
+    for index in range(6):
         shutil.copytree(share_path('resource', 'demo_episode'), folder / f'{TASK}_{index:05d}')
     return folder
 
@@ -112,9 +112,15 @@ def bag_bytes(bag: Path) -> list[bytes]:
         ]
 
 
+def num_started(cluster: Any) -> int:
+    """Return the number of workers that have loaded what they run, on all nodes."""
+    return len(cluster.global_state.actor_table(None, None, 'ALIVE'))
+
+
 def run_and_kill(cluster: Any, words: list[str], out: Path, pattern: str, count: int) -> str:
     """Run a command on two nodes, kill one after the first result; return what it prints."""
     node = cluster.add_node(num_cpus=1, num_gpus=1)
+    cluster.wait_for_nodes()  # until Ray has noticed that the last killed one is gone
     process = subprocess.Popen(
         [sys.executable, '-m', 'mtv_world_ros.cli', *words, '--out', str(out), '--workers', '2',
          '--ray', cluster.address, '--gpus-per-worker', '1'],
@@ -122,11 +128,11 @@ def run_and_kill(cluster: Any, words: list[str], out: Path, pattern: str, count:
     )  # fmt: skip
     try:
         end_s = time.monotonic() + TIMEOUT_S
-        while not list(out.glob(pattern)):
+        # two workers that have started: the killed node is at a job, or about to get one
+        while not list(out.glob(pattern)) or num_started(cluster) < 2:
             assert process.poll() is None, process.communicate()
             assert time.monotonic() < end_s, 'there is no result'
             time.sleep(0.05)
-        # two workers: each node is at a job
         assert len(list(out.glob(pattern))) < count - 1
         cluster.remove_node(node, allow_graceful=False)
         said, _ = process.communicate(timeout=TIMEOUT_S)
