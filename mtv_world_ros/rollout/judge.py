@@ -30,6 +30,7 @@ from mtv_world_ros.success.estimator import SuccessEstimator
 from mtv_world_ros.success.footage_memory import FootageMemory
 from mtv_world_ros.success.task import TaskSpec
 from mtv_world_ros.vision.camera_check import CameraCheck
+from mtv_world_ros.vision.frame_check import StillPictures
 from mtv_world_ros.vision.segmenters.segmenter import Segmenter
 
 
@@ -45,6 +46,8 @@ class JudgeState:
         frame_doubt: reason why the real frames that the plan starts from allow no verdict; empty =
             none.
         observed_doubts: reasons why the real frames before that one are no evidence.
+        still: what the cameras have shown since their pictures changed last; None = no real frame
+            followed the first one.
     """
 
     objects: ObjectForesight
@@ -52,6 +55,7 @@ class JudgeState:
     memory: FootageMemory | None = None
     frame_doubt: str = ''
     observed_doubts: tuple[str, ...] = ()
+    still: StillPictures | None = None
 
     def is_begun(self, num_imagined: int) -> bool:
         """Return True if no real frame was observed since the episode began.

@@ -285,7 +285,9 @@ class SuccessJudge:
             state, chunk.motion, chunk.start_masks, chunk.masks, options, is_real=True
         )
         views = [camera.view for camera in chunk.motion.cameras]
-        doubts = check_stretch(chunk.frames, positions[1:], views)
+        doubts, still = check_stretch(
+            chunk.frames, positions[1:], chunk.period_s, views, state.still
+        )
         estimate = without_verdict(estimate, '; '.join(doubts))
         state = replace(
             state,
@@ -298,6 +300,7 @@ class SuccessJudge:
             ),
             memory=memory,
             observed_doubts=doubts,
+            still=still,
         )
         return Judgement(estimate, None, state)
 

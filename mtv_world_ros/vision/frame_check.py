@@ -28,6 +28,8 @@ class FrameCheckSettings:
         max_still_change: mean difference of two pictures that are the same [grey levels].
         max_frozen_change: largest difference of any pixel in pictures of a frozen camera [grey
             levels].
+        min_still_s: time for which a frozen camera has shown one picture; a slow one shows each
+            twice [s].
         min_joint_motion: joint motion after which two pictures of an arm differ [rad or m].
         max_offset: shift of the arm's outline since the episode began, of a camera that fitted
             then [fraction of image width].
@@ -36,6 +38,7 @@ class FrameCheckSettings:
     min_contrast: float = 4.0
     max_still_change: float = 0.3
     max_frozen_change: int = 2
+    min_still_s: float = 0.5
     min_joint_motion: float = 0.03
     max_offset: float = 0.03
 
@@ -84,32 +87,84 @@ def check_frames(
     return tuple(f"camera '{view}' {reason}" for view, reason in reasons.items() if reason)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StillPictures:
+    """What each of V cameras has shown since its picture changed last.
+
+    Attributes:
+        frames: (V, H, W, 3) uint8 RGB, the first picture of that kind.
+        low: (V, J) smallest joint positions since then [rad or m].
+        high: (V, J) largest ones.
+        still_s: (V,) time since then [s].
+    """
+
+    frames: ByteArray
+    low: FloatArray
+    high: FloatArray
+    still_s: FloatArray
+
+
 def check_stretch(
     frames: ByteArray,
     positions: FloatArray,
+    period_s: float,
     views: Sequence[str],
+    before: StillPictures | None = None,
     settings: FrameCheckSettings = SETTINGS,
-) -> tuple[str, ...]:
-    """Return why frames that follow one another are no evidence, a reason for each such view.
+) -> tuple[tuple[str, ...], StillPictures]:
+    """Return why frames that follow one another are no evidence, and what stood still at the end.
+
+    A camera is frozen if it has shown one picture through all these frames, and for
+    `min_still_s` or longer, while joints moved. Frames may come one at a time.
 
     Args:
         frames: (V, N, H, W, 3) uint8 RGB.
         positions: (N, J) measured joint positions at these frames [rad or m].
+        period_s: time between two frames [s].
         views: names of the V views.
+        before: what stood still at the end of the frames before these, of the same size; None =
+            there were none.
         settings: thresholds.
+
+    Returns:
+        a reason for each view that is no evidence, and the pictures for the frames after these.
     """
-    moved = float(np.ptp(positions, axis=0).max(initial=0.0)) if len(positions) else 0.0
+    still = before or _shown(frames, positions, -period_s)
+    has_changed_within = np.zeros(len(views), bool)
+    for row, position in enumerate(positions):
+        seen = frames[:, row]
+        apart = np.abs(seen.astype(np.int16) - still.frames).max((1, 2, 3), initial=0)
+        has_changed = apart > settings.max_frozen_change
+        if row:
+            has_changed_within |= has_changed
+        new = has_changed[:, None]
+        still = StillPictures(
+            frames=np.where(new[..., None, None], seen, still.frames),
+            low=np.where(new, position, np.minimum(still.low, position)),
+            high=np.where(new, position, np.maximum(still.high, position)),
+            still_s=np.where(has_changed, 0.0, still.still_s + period_s),
+        )
+    moved = (still.high - still.low).max(1, initial=0.0)
+    frozen = ~has_changed_within & (moved >= settings.min_joint_motion)
+    frozen &= still.still_s >= settings.min_still_s
     reasons = []
-    for view, shown in zip(views, frames, strict=True):
+    for view, shown, is_frozen in zip(views, frames, frozen, strict=True):
         contrast = _contrast(shown[-1])
-        change = int(np.ptp(shown, axis=0).max(initial=0))
         if contrast < settings.min_contrast:
             reasons.append(f"camera '{view}' {_BLANK.format(contrast)}")
-        elif moved >= settings.min_joint_motion and change <= settings.max_frozen_change:
+        elif is_frozen:
             reasons.append(
                 f"camera '{view}' shows one picture all the time, although the arm moves"
             )
-    return tuple(reasons)
+    return tuple(reasons), still
+
+
+def _shown(frames: ByteArray, positions: FloatArray, still_s: float) -> StillPictures:
+    """Return the first frame as what stands still from now on."""
+    first = np.repeat(positions[:1], len(frames), axis=0)
+    return StillPictures(
+        frames=frames[:, 0], low=first, high=first, still_s=np.full(len(frames), still_s)
+    )
 
 
 def _contrast(frame: ByteArray) -> float:

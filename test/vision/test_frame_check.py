@@ -11,7 +11,7 @@ from mtv_world_ros.core.data_types import ObjectMasks
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.data.recording import load_recording
 from mtv_world_ros.rollout.pipeline import Pipeline
-from mtv_world_ros.vision.frame_check import check_frames, frame_doubt, lost_objects
+from mtv_world_ros.vision.frame_check import check_frames, check_stretch, frame_doubt, lost_objects
 
 
 @pytest.fixture(scope='module')
@@ -64,6 +64,46 @@ def test_a_camera_that_could_not_be_checked_at_first_is_not_doubted_later(pipeli
     blind = pipeline.judge.camera_checker.check(replace(first, frames=np.zeros_like(first.frames)))
     assert {fit.status for fit in blind.fits} == {'unchecked'}
     assert check_frames(mirrored, first, blind, pipeline.judge.camera_checker) == ()
+
+
+@pytest.fixture
+def stretch(recording):
+    """Twelve frames at 5 Hz while the arm moves, whose second camera freezes at the sixth."""
+    rows = slice(10, 22)
+    frames, positions = recording.frames[:, rows].copy(), recording.positions[rows]
+    frames[1, 6:] = frames[1, 5:6]
+    return frames, positions
+
+
+def _stretches(frames, positions, num):
+    still, found = None, []
+    for start in range(0, len(positions), num):
+        rows = slice(start, start + num)
+        reasons, still = check_stretch(
+            frames[:, rows], positions[rows], 0.2, ['low', 'high'], still
+        )
+        found += reasons
+    return found
+
+
+@pytest.mark.parametrize('num', [1, 2, 6])
+def test_a_camera_that_freezes_is_named_however_few_frames_come_at_once(stretch, num):
+    found = _stretches(*stretch, num)
+    assert found
+    assert {reason.split(' shows')[0] for reason in found} == {"camera 'high'"}
+
+
+@pytest.mark.parametrize('num', [1, 3, 12])
+def test_frames_that_change_are_evidence_however_few_come_at_once(recording, num):
+    assert not _stretches(recording.frames, recording.positions, num)
+
+
+def test_a_slow_camera_and_an_arm_that_rests_are_not_frozen(stretch, recording):
+    frames, positions = stretch
+    assert not _stretches(frames, positions[:1].repeat(len(positions), 0), 1)
+    frames = recording.frames[:, 10:22].copy()
+    frames[:, 1::2] = frames[:, ::2]  # each picture twice
+    assert not _stretches(frames, positions, 1)
 
 
 def test_an_object_in_no_view_is_lost_and_one_in_a_single_view_is_not():
