@@ -88,7 +88,8 @@ def _stretches(frames, positions, num):
 
 @pytest.mark.parametrize('num', [1, 2, 6])
 def test_a_camera_that_freezes_is_named_however_few_frames_come_at_once(stretch, num):
-    found = _stretches(*stretch, num)
+    frames, positions = stretch
+    found = _stretches(frames, positions, num)
     assert found
     assert {reason.split(' shows')[0] for reason in found} == {"camera 'high'"}
 
