@@ -16,7 +16,11 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
+from rclpy.signals import (
+    get_current_signal_handlers_options,
+    SignalHandlerOptions,
+    uninstall_signal_handlers,
+)
 
 from mtv_world_ros.core.errors import ConfigError, MtvWorldError
 from mtv_world_ros.core.processes import (
@@ -57,7 +61,10 @@ def spin_forever(node: Node) -> None:
     """Handle callbacks one after the other until ROS shuts down."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    executor.spin()
+    try:
+        executor.spin()
+    finally:
+        _end_signal_thread()
 
 
 def run(
@@ -174,11 +181,26 @@ def find_log_folder() -> None:
         sys.stderr.write(f"'{folder}' cannot be written ({error}); ROS logs into '{other}'\n")
 
 
+def _end_signal_thread() -> None:
+    """Join rclpy's thread that shuts ROS down after a signal, and restore the handlers before it.
+
+    At each signal that thread walks, without a lock, over a list from which the end of an executor
+    takes away: at a second signal it would read freed memory.
+    """
+    if get_current_signal_handlers_options() != SignalHandlerOptions.NO:
+        uninstall_signal_handlers()
+
+
 def _shut_down(node: Node | None) -> None:
     """End the node; a second Ctrl-C (a launcher sends one too) does not disturb it."""
+    _end_signal_thread()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     if node is not None:
+        if node.executor is not None:
+            # after a callback of an event its iterator holds all inputs and outputs: destroyed or
+            # not, they would keep the middleware's threads running into the end of the process
+            node.executor.shutdown(timeout_sec=0)
         close = getattr(node, 'close', node.destroy_node)
         close()
     rclpy.try_shutdown()
