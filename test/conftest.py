@@ -8,7 +8,9 @@ from importlib.util import find_spec
 import os
 from pathlib import Path
 import shutil
+import signal
 import sys
+import tempfile
 import warnings
 
 import pytest
@@ -150,6 +152,22 @@ def nothing_left_behind() -> Iterator[None]:
     assert not found or os.environ.get('MTV_WORLD_LEFT_BEHIND') != 'error', said
     if found:
         warnings.warn(said, stacklevel=1)
+
+
+@pytest.fixture(scope='module')
+def own_ray() -> Iterator[None]:
+    """Folder of Ray for this process alone, and what Ray changes in the process is given back.
+
+    By default Ray joins the last cluster of the machine, which may be that of another test
+    process. Paths of Ray's sockets are long: the folder cannot lie in a test's own.
+    """
+    environment, handler = dict(os.environ), signal.getsignal(signal.SIGTERM)
+    with tempfile.TemporaryDirectory(prefix='ray_', ignore_cleanup_errors=True) as folder:
+        os.environ['RAY_TMPDIR'] = folder
+        yield
+        os.environ.clear()
+        os.environ.update(environment)
+        signal.signal(signal.SIGTERM, handler)
 
 
 @pytest.fixture

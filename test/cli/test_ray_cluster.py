@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import json
-import os
 from pathlib import Path
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -25,6 +23,8 @@ cluster_utils = pytest.importorskip(
 
 pytestmark = pytest.mark.slow
 TIMEOUT_S = 600.0
+#: runs of a command until a node is killed in its middle
+MOST_TRIES = 3
 TASK = 'stack_blocks_two'
 MODEL = ['--steps', '1', '--segmenter', 'colour', '--threads', '1']
 #: command, pattern of the files of its results, and how many there are in the end
@@ -56,18 +56,14 @@ COMMANDS = {
 
 
 @pytest.fixture(scope='module')
-def cluster() -> Iterator[Any]:
-    """A node of one CPU and one logical GPU; the environment that Ray changes is given back."""
-    environment, handler = dict(os.environ), signal.getsignal(signal.SIGTERM)
+def cluster(own_ray: None) -> Iterator[Any]:
+    """A node of one CPU and one logical GPU."""
     cluster = cluster_utils.Cluster(
         initialize_head=True,
         head_node_args={'num_cpus': 1, 'num_gpus': 1, 'include_dashboard': False},
     )
     yield cluster
     cluster.shutdown()
-    os.environ.clear()
-    os.environ.update(environment)
-    signal.signal(signal.SIGTERM, handler)
 
 
 @pytest.fixture(scope='module')
@@ -118,7 +114,11 @@ def num_started(cluster: Any) -> int:
 
 
 def run_and_kill(cluster: Any, words: list[str], out: Path, pattern: str, count: int) -> str:
-    """Run a command on two nodes, kill one after the first result; return what it prints."""
+    """Run a command on two nodes, kill one after the first result; return what it prints.
+
+    Nothing is killed, and the text is empty, where the second worker started so late that the
+    first one had nearly all results.
+    """
     node = cluster.add_node(num_cpus=1, num_gpus=1)
     cluster.wait_for_nodes()  # until Ray has noticed that the last killed one is gone
     process = subprocess.Popen(
@@ -133,8 +133,10 @@ def run_and_kill(cluster: Any, words: list[str], out: Path, pattern: str, count:
             assert process.poll() is None, process.communicate()
             assert time.monotonic() < end_s, 'there is no result'
             time.sleep(0.05)
-        assert len(list(out.glob(pattern))) < count - 1
+        is_early = len(list(out.glob(pattern))) < count - 1
         cluster.remove_node(node, allow_graceful=False)
+        if not is_early:
+            return ''
         said, _ = process.communicate(timeout=TIMEOUT_S)
     finally:
         process.kill()
@@ -150,8 +152,11 @@ def test_results_are_complete_and_the_same_when_a_node_is_killed_in_the_middle(
         pytest.skip(reason)
     command, pattern, count = COMMANDS[name]
     words = [str(data) if word == 'DATA' else word for word in command]
-    alone, shared = tmp_path / 'alone', tmp_path / 'shared'
-    said = run_and_kill(cluster, words, shared, pattern, count)
+    alone = tmp_path / 'alone'
+    for number in range(MOST_TRIES):
+        shared = tmp_path / f'shared_{number}'
+        if said := run_and_kill(cluster, words, shared, pattern, count):
+            break
     assert said.count('a Ray worker died; 1 go on') == 1, said
     assert main([*words, '--out', str(alone)]) == 0
     assert len(list(shared.glob(pattern))) == count

@@ -327,9 +327,9 @@ def test_a_template_has_fields_of_texts_and_whole_numbers(template, text):
 )
 def test_a_template_with_anything_else_is_refused_in_time_and_memory(template):
     tracemalloc.start()
-    begin_s = time.perf_counter()
+    begin_s = time.process_time()
     with pytest.raises(ValueError, match='no field|whole number|no text|characters'):
         fill_template(template, {'episode': 42, 'key': 'front'})
-    assert time.perf_counter() - begin_s < MOST_S
+    assert time.process_time() - begin_s < MOST_S
     assert tracemalloc.get_traced_memory()[1] < 2**20
     tracemalloc.stop()

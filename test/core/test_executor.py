@@ -1,5 +1,4 @@
 import os
-import signal
 import sys
 
 import pytest
@@ -30,16 +29,11 @@ def make_scorer():
 
 
 @pytest.fixture
-def ray_environment():
-    """Ray is installed; what it sets in this process is given back."""
-    ray = pytest.importorskip(
+def ray_environment(own_ray):
+    """Ray is installed, and finds no cluster of another process."""
+    return pytest.importorskip(
         'ray', reason="Ray is not installed: pip install 'mtv_world_ros[rank]'"
     )
-    environment, handler = dict(os.environ), signal.getsignal(signal.SIGTERM)
-    yield ray
-    os.environ.clear()
-    os.environ.update(environment)
-    signal.signal(signal.SIGTERM, handler)
 
 
 @pytest.fixture

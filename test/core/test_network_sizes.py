@@ -92,11 +92,11 @@ def test_a_checkpoint_beyond_the_bounds_takes_neither_time_nor_memory(
     if field == 'width':
         values |= {'num_frames': 10_000, 'height': 16384}
     (folder / part).write_text(json.dumps(values))
-    begin_s = time.perf_counter()
+    begin_s = time.process_time()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(CheckpointError, match='at most'):
         load_trained_model(Checkpoint.open(folder))
-    assert time.perf_counter() - begin_s < MOST_S
+    assert time.process_time() - begin_s < MOST_S
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MOST_MB * 1024
 
 

@@ -63,7 +63,7 @@ def test_a_stopped_worker_is_an_error_within_seconds():
             assert number == result
             done.append(number)
     assert done and 3 not in done
-    assert time.monotonic() - begin_s < 60.0
+    assert time.monotonic() - begin_s < 180.0  # without an end otherwise
 
 
 def test_forked_workers_that_note_sigterm_as_training_does_end_with_a_broken_pool():
@@ -117,17 +117,18 @@ def test_an_interrupted_command_does_not_wait_for_the_jobs_of_its_workers(tmp_pa
     def interrupt():
         while not list(tmp_path.iterdir()):
             time.sleep(0.05)
+        interrupted_s.append(time.monotonic())
         os.kill(os.getpid(), signal.SIGINT)
 
+    interrupted_s = []
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Thread(target=interrupt, daemon=True).start()
-    begin_s = time.monotonic()
     try:
         with pytest.raises(KeyboardInterrupt):
             list(run_all([1, 2, 3], LongJobs(tmp_path), Workers(count=2, threads=1)))
     finally:
         signal.signal(signal.SIGINT, before)
-    assert time.monotonic() - begin_s < 45.0  # of a busy machine; a job takes 60
+    assert time.monotonic() - interrupted_s[0] < 45.0  # of a busy machine; a job takes 60
     assert not [pid for pid in tmp_path.iterdir() if is_alive(pid.name)]
 
 
@@ -142,7 +143,7 @@ def is_alive(pid):
 def test_a_worker_neither_gets_nor_holds_back_the_ctrl_c_of_a_terminal(method):
     pool = WorkerPool(make_held_back, 1, method=method)
     try:
-        found = pool.submit(run_job).result(60)
+        found = pool.submit(run_job).result(180)
     finally:
         pool.shutdown()
     assert found == (False, True)

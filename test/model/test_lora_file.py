@@ -46,10 +46,10 @@ SETTINGS = {
 )
 def test_a_pattern_that_could_take_forever_is_refused_in_time(pattern):
     settings = PeftSettings(r=4, lora_alpha=1.0, rank_pattern={pattern: 4})
-    begin_s = time.perf_counter()
+    begin_s = time.process_time()
     with pytest.raises(ConfigError, match='could take forever'):
         settings.scale('a' * 60, 4)
-    assert time.perf_counter() - begin_s < 0.5
+    assert time.process_time() - begin_s < 0.5
 
 
 @pytest.mark.parametrize('pattern', ['to_q', r'blocks\.\d+\.to_q', r'.*attn[12].*', r'a\+b'])

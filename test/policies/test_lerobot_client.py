@@ -27,7 +27,7 @@ def server():
 def make(tmp_path, port, **changes):
     values = policy_values('lerobot')
     values['policy']['actions_per_chunk'] = 6
-    values |= {'server': f'127.0.0.1:{port}', 'timeout_s': 1.5, **changes}
+    values |= {'server': f'127.0.0.1:{port}', **changes}
     return make_policy(tmp_path, values)
 
 
@@ -83,7 +83,7 @@ def test_an_answer_that_would_execute_code_is_refused(tmp_path, server):
 
 
 def test_a_late_answer_is_told(tmp_path, server):
-    policy = make(tmp_path, server)
+    policy = make(tmp_path, server, timeout_s=3.0)
     policy.reset(seed=0)
     with pytest.raises(PolicyError, match='DEADLINE_EXCEEDED'):
         policy.act(observe(), 'sleep')

@@ -79,10 +79,10 @@ def test_links_out_of_a_folder_are_named_and_not_followed(tmp_path, monkeypatch)
     (mine / 'others').symlink_to(other)
     (mine / 'again').symlink_to(mine)
     (mine / 'link to one').symlink_to(outside)
-    begin_s = time.monotonic()
+    begin_s = time.process_time()
     with pytest.warns(LinkWarning) as said:
         found = list_episodes(mine)
-    assert time.monotonic() - begin_s < 5.0
+    assert time.process_time() - begin_s < 5.0
     assert found == [inside, mine / 'link to one']
     texts = sorted(str(one.message) for one in said)
     assert len(texts) == 2

@@ -6,7 +6,9 @@ import numpy as np
 
 from mtv_world_ros.core.data_types import JointTrajectory
 
-LATE_S = 2.5
+LATE_S = 7.5
+#: the slow policy is still thinking when another plan has come, on a busy machine, too
+SLOW_S = 3.0
 
 
 class FakePolicy:
@@ -43,7 +45,7 @@ def crash():
 
 FAULTS = {
     'late': lambda: time.sleep(LATE_S),
-    'slow': lambda: time.sleep(1.0),
+    'slow': lambda: time.sleep(SLOW_S),
     'crashes': crash,
 }
 JOINTS = tuple(

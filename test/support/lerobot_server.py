@@ -107,7 +107,7 @@ class Server:
         if raw['task'] == 'fail' or self.config is None:
             return self.messages['Empty']()
         if raw['task'] == 'sleep':
-            time.sleep(2.0)
+            time.sleep(5.0)
         if raw['task'] == 'evil':
             return self.messages['Actions'](data=pickle.dumps(Evil()))
         features = self.config.lerobot_features

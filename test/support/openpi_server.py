@@ -66,7 +66,7 @@ def infer(request):
     if prompt == 'fail':
         raise KeyError('no such checkpoint')
     if prompt == 'sleep':
-        time.sleep(1.5)
+        time.sleep(3.0)
     actions = request['state'][None] + 0.01 * np.arange(1, 11)[:, None]
     if prompt == 'nan':
         actions[3, 2] = np.nan

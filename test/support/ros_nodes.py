@@ -36,7 +36,7 @@ from mtv_world_ros.ros.policy.node import PolicyNode
 from mtv_world_ros.ros.world_model.node import main, WorldModelNode
 from test.support.fake_policy import load as load_fake_policy
 from test.support.fake_world_model import load as load_fake
-from test.support.in_process import NodeInProcess, run_to_end
+from test.support.in_process import NodeInProcess, PATIENCE_S, run_to_end
 from test.support.ros_domain import claim_domain
 
 os.environ['ROS_DOMAIN_ID'] = str(claim_domain())
@@ -79,7 +79,7 @@ MATCH_AGAIN_S = 12.0
 #: messages that subscriptions of tests keep: chunks are published in bursts, while a busy machine
 #: takes long to take them
 KEPT = 100
-TIMEOUT_S = 60.0  # a busy machine takes long to start a node
+TIMEOUT_S = 120.0  # a busy machine takes long to start a node
 
 
 def make_calibration(path):
@@ -139,7 +139,7 @@ class Client:
         self.executor.add_node(self.node)
         self.callers = [Participant(self.context, self.node, self.executor)]
         self.received, self.totals = defaultdict(list), Counter()
-        self.publishers, self.services = {}, {}
+        self.publishers, self.services, self.subscriptions = {}, {}, {}
         self.gone = set()
         self.subscribe(DiagnosticArray, '/world_model/report', 100)
         self.subscribe(DiagnosticArray, '/diagnostics', 10)
@@ -174,7 +174,9 @@ class Client:
             self.totals[topic] += 1
 
         profile = QoSProfile(depth=depth, reliability=reliability, durability=durability)
-        self.node.create_subscription(kind, topic, keep, profile)
+        if topic in self.subscriptions:  # of an earlier test: each message would come twice
+            self.node.destroy_subscription(self.subscriptions[topic])
+        self.subscriptions[topic] = self.node.create_subscription(kind, topic, keep, profile)
 
     def publish(self, topic, message, *, latched=False):
         """Publish reliably; the first time on a topic waits until the node is connected."""
@@ -214,6 +216,19 @@ class Client:
         while not condition():
             assert time.monotonic() < end, f'waited {timeout_s} s for {what}'
             self._spin_once()
+
+    def wait_until_seen(self, process, stamp_ns):
+        """Wait until a node in this process has the images of a moment, of all views.
+
+        Its subscriptions have depth 1, as for any camera: the next image would replace them.
+        """
+        buffer = process.node._configured._buffer
+        self.wait(lambda: buffer.newest_stamp_ns == stamp_ns, 'the images in the node')
+
+    def wait_until_told(self, process, **texts):
+        """Wait until a node in this process has `instruction` or `stored_objects`."""
+        maker = process.node._configured._maker
+        self.wait(lambda: all(getattr(maker, key) == text for key, text in texts.items()), texts)
 
     def spin_for(self, seconds):
         end = time.monotonic() + seconds
@@ -498,7 +513,7 @@ class NodeProcess:
     def stop(self, number=signal.SIGTERM):
         if self.process.poll() is None:
             self.process.send_signal(number)
-        self.process.wait(timeout=120)
+        self.process.wait(timeout=PATIENCE_S)
         return self.process.returncode
 
     def output(self):

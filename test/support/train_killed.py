@@ -51,6 +51,19 @@ def written_at(out: Path) -> int:
         return 0
 
 
+def stopped_while_saving(child: int, out: Path) -> bool:
+    """Stop a process that writes its state; one that has written it meanwhile goes on."""
+    if not any(out.glob('.state.mtv-new-*')):
+        return False
+    os.kill(child, signal.SIGSTOP)
+    _, status = os.waitpid(child, os.WUNTRACED)
+    assert os.WIFSTOPPED(status), status
+    if any(out.glob('.state.mtv-new-*')):
+        return True
+    os.kill(child, signal.SIGCONT)
+    return False
+
+
 def kill(child: int, out: Path, *, saving: bool, after: float) -> str | None:
     """Kill a process some seconds after it began to step, or then while it writes its state."""
     before = written_at(out)
@@ -59,7 +72,7 @@ def kill(child: int, out: Path, *, saving: bool, after: float) -> str | None:
             return None
         time.sleep(0.001)
     time.sleep(after)
-    while saving and not any(out.glob('.state.mtv-new-*')):
+    while saving and not stopped_while_saving(child, out):
         if finished(child):
             return None
     if finished(child):

@@ -37,16 +37,18 @@ def start(number: int, port: int, out: Path, episodes: Path, preset: Path) -> in
         os._exit(1)
 
 
-def free_port() -> int:
-    """A port that nothing listens on."""
-    with socket.socket() as probe:
-        probe.bind(('127.0.0.1', 0))
-        return probe.getsockname()[1]
+def held_port() -> socket.socket:
+    """Return a socket whose port no other program is given, and torch can listen on."""
+    held = socket.socket()
+    held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    held.bind(('127.0.0.1', 0))
+    return held
 
 
 if __name__ == '__main__':
     folder, bags, file = (Path(argument) for argument in sys.argv[1:])
-    chosen = free_port()
+    held = held_port()
+    chosen = held.getsockname()[1]
     main, other = (start(number, chosen, folder, bags, file) for number in (0, 1))
     while not (folder / 'state' / 'state.json').exists():
         time.sleep(0.01)

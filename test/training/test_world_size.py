@@ -24,6 +24,8 @@ from test.support.sources import (
 )
 
 STEPS = 12
+#: trainings until one is killed in its middle, which a busy machine may come too late for
+MOST_TRIES = 3
 VALUES = {**TINY_MODEL, 'optimizer.batch_size': 5, 'optimizer.steps': STEPS}
 SHARDED = ['--set=optimizer.fully_shard=true']
 
@@ -49,6 +51,19 @@ def step_of(out: Path) -> int:
         return 0
 
 
+def kill_second(out: Path, words: list[str]) -> tuple[int, str]:
+    """Kill the second of two processes after two steps; return status and stderr."""
+    end_s = time.monotonic() + 600
+    with start_torchrun(2, words) as launcher:
+        while step_of(out) < 2:
+            assert launcher.poll() is None and time.monotonic() < end_s
+            time.sleep(0.01)
+        if step_of(out) < STEPS:
+            os.kill(rank_pid(launcher.pid, 1), signal.SIGKILL)
+        _, errors = launcher.communicate(timeout=600)
+    return launcher.returncode, errors
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ('first', 'then', 'count'), [([], [], 4), (SHARDED, SHARDED, 3), (SHARDED, [], 1)]
@@ -56,14 +71,12 @@ def step_of(out: Path) -> int:
 def test_a_killed_process_is_named_and_another_count_goes_on(
     episode, whole, tmp_path, first, then, count
 ):
-    out, end = tmp_path / 'out', time.monotonic() + 600
-    with start_torchrun(2, [*words_of(episode, out), *first]) as launcher:
-        while step_of(out) < 2:
-            assert launcher.poll() is None and time.monotonic() < end
-            time.sleep(0.01)
-        os.kill(rank_pid(launcher.pid, 1), signal.SIGKILL)
-        _, errors = launcher.communicate(timeout=600)
-    assert launcher.returncode != 0
+    for number in range(MOST_TRIES):
+        out = tmp_path / f'out_{number}'
+        status, errors = kill_second(out, [*words_of(episode, out), *first])
+        if step_of(out) < STEPS:  # else the training was over before it was killed
+            break
+    assert status != 0
     assert 'rank      : 1' in errors and 'lost process 1' in errors, errors
     assert 2 <= step_of(out) < STEPS
     status, said, errors = torchrun(count, [*words_of(episode, out), *then])

@@ -484,6 +484,7 @@ class Player(Node):
             self._clock_output.publish(Clock(clock=to_stamp(bag_ns)))
 
     def _on_report(self, message: DiagnosticArray) -> None:
+        self._was_reported = True
         for status in message.status:
             values = values_of(status)
             chunk = values.get('rollout', ''), values.get('chunk', '')

@@ -3,10 +3,10 @@
 from contextlib import suppress
 from pathlib import Path
 import re
-import select
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -17,7 +17,7 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import CompressedImage, JointState
-from std_msgs.msg import String
+from std_msgs.msg import Float32MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from mtv_world_ros.cameras.calibration_file import load_calibration
@@ -28,6 +28,7 @@ from mtv_world_ros.data.episode import PLACE
 from mtv_world_ros.data.episode_writer import EpisodeWriter
 from mtv_world_ros.importing.recover import find_damaged, recover
 from mtv_world_ros.ros.messages.conversions import NANO, to_ns
+from test.support.in_process import PATIENCE_S
 
 START_NS = 1_700_000_000 * NANO
 STEP_NS = 100_000_000
@@ -101,7 +102,7 @@ def launch(ros):
     for process in started:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
-        process.wait(timeout=120)
+        process.wait(timeout=PATIENCE_S)
 
 
 @pytest.fixture
@@ -116,19 +117,23 @@ def node(tmp_path, ros):
 def finish(process, number=None):
     if number is not None:
         process.send_signal(number)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=PATIENCE_S)
     return process.returncode, output
 
 
 @pytest.mark.slow
-def test_episode_is_imagined_in_lock_step_and_recorded(node, episode, launch, tmp_path):
+def test_episode_is_imagined_in_lock_step_and_recorded(node, episode, launch, client, tmp_path):
     out = tmp_path / 'predictions'
+    compared = client.received[FIDELITY]
+    compared.clear()
+    client.connect_outputs({FIDELITY: Float32MultiArray})
     recorder = launch('recorder', out, *RECORDED, '--stamp', 'header')
     everybody = ('--wait-for', '/joint_trajectory', *RECORDED)
     player = launch('player', episode, '--clock', '--lock-step', '--rate', '4', *everybody)
     code, said = finish(player)
     assert code == 0, said
     assert '2 trajectories, 2 done' in said
+    client.wait(lambda: compared, 'the fidelity, which comes after the frames')
     assert not out.exists()  # it gets its name when it is complete
     code, said = finish(recorder, signal.SIGINT)
     assert code == 0, said
@@ -226,10 +231,12 @@ def test_loop_with_a_clock_starts_over_and_the_node_goes_on(node, episode, launc
     client = ros.Client()
     try:
         player = launch('player', episode, '--clock', '--loop', '--lock-step', '--rate', '4')
-        client.wait(lambda: len(client.report_values('done')) >= 5, 'three rounds', 40)
+        client.wait(lambda: len(client.report_values('done')) >= 5, 'three rounds')
         plans = [r['trajectory_stamp_ns'] for r in client.report_values('done')]
         assert len(set(plans)) == 2
-        assert int(client.diagnostic_values().get('clock_jumps_back', 0)) >= 1
+        client.wait(
+            lambda: int(client.diagnostic_values().get('clock_jumps_back', 0)) >= 1, 'the jump'
+        )
         code, said = finish(player, signal.SIGINT)
         assert code == 0 and 'Traceback' not in said
     finally:
@@ -264,13 +271,14 @@ def test_a_plan_without_an_answer_is_a_failure_unless_the_player_is_stopped(
 ):
     """Somebody reports, takes plans, and never answers."""
     client.subscribe(JointTrajectory, '/joint_trajectory', depth=10)
-    client.node.create_publisher(ros.REPORT, '/world_model/report', 10)
+    reports = client.node.create_publisher(ros.REPORT, '/world_model/report', 10)
     taken = client.received['/joint_trajectory']
     taken.clear()
     timeout = '60' if stops else '0.5'
     player = launch('player', episode, '--rate', '4', '--answer-timeout', timeout)
     client.wait(lambda: len(taken) >= len(PLANS), 'both plans')
     code, said = finish(player, signal.SIGINT if stops else None)
+    client.node.destroy_publisher(reports)
     assert 'Traceback' not in said
     if stops:
         assert code == 0, said
@@ -281,17 +289,17 @@ def test_a_plan_without_an_answer_is_a_failure_unless_the_player_is_stopped(
 
 @pytest.mark.slow
 def test_plans_of_a_node_that_ended_meanwhile_are_a_failure(episode, launch, client, ros):
-    client.subscribe(JointTrajectory, '/joint_trajectory', depth=10)
     reports = client.node.create_publisher(ros.REPORT, '/ended/report', 10)
-    taken = client.received['/joint_trajectory']
-    taken.clear()
-    options = ('--rate', '0.2', '--answer-timeout', '20', '--report-topic', '/ended/report')
-    player = launch('player', episode, *options)
-    # the player has to know the publisher before it goes, on a busy machine, too: an
-    # acknowledgement comes from a reader that knows its writer
-    client.wait(lambda: reports.get_subscription_count() > 0, 'the player to read reports', 60)
+    options = ('--rate', '0.2', '--answer-timeout', '60', '--report-topic', '/ended/report')
+    remap = ('--ros-args', '-r', '/joint_trajectory:=/ended/plan')
+    player = launch('player', episode, *options, *remap)
+    # it knows the publisher before it plays, on a busy machine, too: an acknowledgement comes from
+    # a reader that knows its writer, and nobody reads the plans until then
+    client.wait(lambda: reports.get_subscription_count() > 0, 'the player to read reports')
     reports.publish(ros.REPORT())
-    assert reports.wait_for_all_acked(Duration(seconds=60))
+    assert reports.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+    client.subscribe(JointTrajectory, '/ended/plan', depth=10)
+    taken = client.received['/ended/plan']
     client.wait(lambda: len(taken) >= len(PLANS), 'both plans')
     client.node.destroy_publisher(reports)
     code, said = finish(player)
@@ -338,12 +346,12 @@ def test_a_node_that_loads_or_does_not_hear_the_cameras_yet_is_waited_for(
     try:
         options = ['--rate', '4', '--report-topic', '/deaf/report']
         player = launch('player', episode, *options, *(['--lock-step'] if lock_step else []))
-        client.wait(lambda: all(i.get_publisher_count() for i in inputs), 'the player', 60)
+        client.wait(lambda: all(i.get_publisher_count() for i in inputs), 'the player')
         until_s = time.monotonic() + 5
         while time.monotonic() < until_s:  # longer than connections take to settle
             client.executor.spin_once(timeout_sec=0.05)
         heard = True
-        client.wait(lambda: player.poll() is not None, 'the end of the player', 60)
+        client.wait(lambda: player.poll() is not None, 'the end of the player')
         code, said = finish(player)
     finally:
         client.executor.remove_node(model)
@@ -379,7 +387,7 @@ def test_only_plans_that_the_reporting_node_reads_are_to_be_answered(
     try:
         options = ('--answer-timeout', '5', '--report-topic', '/fake/report', *options)
         player = launch('player', path, *options)
-        client.wait(lambda: player.poll() is not None, 'the end of the player', 40)
+        client.wait(lambda: player.poll() is not None, 'the end of the player')
         code, said = finish(player)
     finally:
         for one in (model, listener):
@@ -496,13 +504,15 @@ def recorded(launch, tmp_path, ros):
 
 @pytest.mark.slow
 def test_a_recorder_stops_soon_though_publishers_go_on(recorded, tmp_path):
-    recorder, client, _ = recorded
+    recorder, client, sent = recorded
+    num_sent = len(sent)  # a busy machine sends fewer than 100 a second
+    assert num_sent > 10
     recorder.send_signal(signal.SIGINT)
     # it would wait for a silence that never comes; no shorter limit holds on a busy machine
     client.wait(lambda: recorder.poll() is not None, 'the end of the recorder', 30.0)
     assert recorder.returncode == 0
     with AnyReader([tmp_path / 'bag']) as bag:
-        assert bag.message_count > 150
+        assert bag.message_count > 0.75 * num_sent
 
 
 def test_a_recorder_that_is_stopped_before_it_records_says_so(launch, tmp_path):
@@ -530,7 +540,9 @@ def test_a_killed_recorder_loses_no_more_than_a_second(recorded, tmp_path):
     stamps = [message.stamp_ns for message in BagReader(bag.path).messages()]
     assert len(stamps) >= len([at for at in sent if at < killed - 1.0 - starved])
     age_s = (time.time_ns() - stamps[-1]) / NANO - (time.monotonic() - killed)
-    assert age_s < 1.0 + starved
+    # nothing was there to record while the sender did not run either
+    pauses_s = np.diff([at for at in sent if at > killed - 2.0 - starved] + [killed])
+    assert age_s < 1.0 + starved + max(pauses_s)
     with AnyReader([tmp_path / 'bag']) as read:
         assert read.message_count == len(stamps)
 
@@ -544,15 +556,29 @@ def test_a_topic_that_brings_nothing_is_named_and_so_is_its_beginning(launch, tm
     for publisher in (talks, mute, late):
         client.wait(publisher.get_subscription_count, 'the recorder')
     lines = []
-    while not (lines and 'nothing came of' in lines[-1]):
+
+    def read():
+        for line in recorder.stdout:
+            lines.append(line)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+
+    def line_with(text):
         talks.publish(String(data='a'))
-        if select.select([recorder.stdout], [], [], 0.1)[0]:
-            lines.append(recorder.stdout.readline())
-    assert 'nothing came of /late, /mute in the 2.' in lines[-1]
+        client.spin_for(0.1)
+        return next((line for line in lines if text in line), '')
+
+    client.wait(lambda: line_with('nothing came of'), 'the topics that bring nothing')
+    named = re.search(r'nothing came of /late, /mute in the (\d+\.\d) s', ''.join(lines))
+    assert named and float(named[1]) >= 2.0, lines
     late.publish(String(data='b'))
-    assert re.search(r"/late began \d+\.\d s after 'recording'", recorder.stdout.readline())
-    code, said = finish(recorder, signal.SIGINT)
-    assert code == 0
+    client.wait(lambda: line_with("s after 'recording'"), 'the beginning')
+    recorder.send_signal(signal.SIGINT)
+    assert recorder.wait(PATIENCE_S) == 0
+    reader.join()
+    said = ''.join(lines)
+    assert re.search(r"/late began \d+\.\d s after 'recording'", said), said
     assert re.search(r'/late 1, /mute 0, /talks \d+$', said.strip()), said
 
 
@@ -587,7 +613,7 @@ def test_two_robots_and_two_players_do_not_meet(episode, launch, tmp_path, ros, 
             for rate, space in zip(('4', '2'), spaces, strict=True)
         )
         for player in (first, second):
-            client.wait(lambda p=player: p.poll() is not None, 'a player', 60)
+            client.wait(lambda p=player: p.poll() is not None, 'a player')
             code, said = finish(player)
             assert code == 0, said
             assert '2 trajectories, 2 done' in said

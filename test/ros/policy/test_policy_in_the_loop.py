@@ -54,7 +54,7 @@ class Stack:
         self.world = ros.start_node(
             folder, 'pace:=burst', 'mode:=imagine', 'max_trajectory_age_s:=0.001', *ages
         )
-        self.policy = ros.start_policy(folder, 'answer_timeout_s:=1.5', *ages)
+        self.policy = ros.start_policy(folder, 'answer_timeout_s:=4.5', *ages)
         client.subscribe(ros.REPORT, '/policy/report', 100)
         client.subscribe(ros.PLAN, '/joint_trajectory', 10)
         client.connect_outputs(

@@ -27,12 +27,12 @@ def moved(ros, view, pixels):
     return np.roll(ros.make_pixels(view), pixels, axis=1)
 
 
-def send_images(ros, client, stamp_ns, shift):
+def send_images(node, ros, client, stamp_ns, shift):
     for view in ros.VIEWS:
         message = ros.make_image(view, stamp_ns)
         message.data = moved(ros, view, shift).tobytes()
         client.publish(f'/{view}/image_raw', message)
-    client.spin_for(0.15)  # the node's subscriptions have depth 1, as for any camera
+    client.wait_until_seen(node, stamp_ns)
 
 
 def compared(client, count):
@@ -50,7 +50,7 @@ def test_images_that_move_as_imagined_score_one_and_those_that_stay_do_not(node,
         client.send_trajectory()
         client.wait(lambda n=ended: len(client.report_values('done')) > n, 'the rollout')
         for k in range(1, 5):
-            send_images(ros, client, start_ns + k * PERIOD_NS, k * shift)
+            send_images(node, ros, client, start_ns + k * PERIOD_NS, k * shift)
         said = compared(client, before + 1)
         client.wait(lambda n=before: len(client.received[FIDELITY]) > n, 'the topic')
         assert said['frames_compared'] == '4'
@@ -69,7 +69,7 @@ def test_what_was_given_up_by_a_reset_is_not_compared(node, ros, client):
     client.wait(lambda: len(client.report_values('done')) > ended, 'the rollout')
     client.reset()
     for k in range(1, 5):
-        send_images(ros, client, start_ns + k * PERIOD_NS, 0)
+        send_images(node, ros, client, start_ns + k * PERIOD_NS, 0)
     client.spin_for(0.5)
     assert len(client.report_values('fidelity')) == before
 

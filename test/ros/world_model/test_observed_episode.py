@@ -23,8 +23,8 @@ def node(tmp_path, ros):
 class Stage:
     """A clock and a scene that moves to the left, as seen by the node's cameras."""
 
-    def __init__(self, ros, client):
-        self._ros, self._client = ros, client
+    def __init__(self, node, ros, client):
+        self._node, self._ros, self._client = node, ros, client
         self._clock = client.node.create_publisher(Clock, '/clock', 10)
         client.connect_inputs(ros.INPUTS)
         client.wait(self._clock.get_subscription_count, 'a subscriber of /clock')
@@ -47,7 +47,7 @@ class Stage:
             message.data = np.roll(self._ros.make_pixels(view), -shift, axis=1).tobytes()
             changes[f'image_{view}'] = message
         self._client.send_scene(stamp_ns, **changes)
-        self._client.spin_for(0.15)
+        self._client.wait_until_seen(self._node, stamp_ns)
 
     def plan(self):
         """J of the object that the task does not move, with its first mask."""
@@ -72,13 +72,13 @@ class Stage:
 
 
 def test_first_masks_are_remembered_over_plans_until_something_begins_anew(node, client, ros):
-    stage = Stage(ros, client)
+    stage = Stage(node, ros, client)
     begin_ns = 1_000 * NANO
     first = stage.live(begin_ns)
     assert first < 0.4  # the chunk moves the block by most of its width
     assert stage.plan() > 0.6  # where it was in the first plan's first frame
     client.publish('/instruction', String(data=f'{INSTRUCTION}.'))
-    client.spin_for(0.3)
+    client.wait_until_told(node, instruction=f'{INSTRUCTION}.')
     assert stage.plan() < 0.4
     stage.live(begin_ns + 10 * NANO)
     assert stage.plan() > 0.6

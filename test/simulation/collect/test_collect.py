@@ -78,7 +78,7 @@ def _same(one: Path, other: Path):
         assert (one / file).read_bytes() == (other / file).read_bytes(), file
 
 
-def _wait_for(condition, seconds=60.0):
+def _wait_for(condition, seconds=240.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
