@@ -71,6 +71,7 @@ def kill_second(out: Path, words: list[str]) -> tuple[int, str]:
 def test_a_killed_process_is_named_and_another_count_goes_on(
     episode, whole, tmp_path, first, then, count
 ):
+    out, status, errors = tmp_path, 0, ''
     for number in range(MOST_TRIES):
         out = tmp_path / f'out_{number}'
         status, errors = kill_second(out, [*words_of(episode, out), *first])
