@@ -2,6 +2,7 @@
 
     python experiments/real_recordings.py verdicts EPISODES [--task TASK.yaml] [--every 8]
     python experiments/real_recordings.py grips EPISODES [--robot ROBOT] [--out FOLDER]
+    python experiments/real_recordings.py fingers EPISODES
     python experiments/real_recordings.py shares EPISODES [--every 16] [--stop-holds 0.75]
                                 [--contact FOLDER] [--memory off]
     python experiments/real_recordings.py left-out EPISODES [--every 16] [--task TASK.yaml]
@@ -18,7 +19,9 @@ frames, so that most cuts are failures; somebody who looks at the frames says wh
 right. `grips` prints when something stops the fingers, and whether it is held by the masks that
 follow, which somebody compares with the frames (--out has pictures of each stop); of
 simulated episodes it counts the frames in which an object goes along with a tool, and in which all
-are far from it, with the stops among them. `shares` foresees the rest of a recording from later
+are far from it, with the stops among them. `fingers` compares where a dark gripper ends in the
+pictures with where it is drawn, along the tool's axis, with the fingers free and drawn below the
+table; only frames in which nothing else beside the gripper is dark say something. `shares` foresees the rest of a recording from later
 and later frames, by the masks of the import, and prints the share of futures in which the task
 succeeds, with and without the memory of what frames before showed; no picture is imagined.
 `left-out` does so with numbers of contact that are fitted on the other recordings, prints the
@@ -50,7 +53,7 @@ import numpy as np
 from numpy.typing import NDArray
 from page import table
 
-from mtv_world_ros.cameras.camera import camera_poses
+from mtv_world_ros.cameras.camera import camera_poses, project
 from mtv_world_ros.cameras.motion import Motion
 from mtv_world_ros.control.mark_leaks import has_colour
 from mtv_world_ros.control.trajectory_video import arm_colour, FINGER_COLOURS
@@ -79,6 +82,7 @@ from mtv_world_ros.model.checkpoint import Checkpoint
 from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.checkpoint_files import load_contact
 from mtv_world_ros.physics.contact_settings import ContactSettings
+from mtv_world_ros.physics.engine.contact_scene import CompiledScene
 from mtv_world_ros.physics.fitting.contact_fit import (
     first_settings,
     read_recordings,
@@ -89,7 +93,7 @@ from mtv_world_ros.physics.grasp_attempts import foreseen_attempts
 from mtv_world_ros.physics.grips import watch_fingers
 from mtv_world_ros.physics.object_motion import FoundObjects
 from mtv_world_ros.physics.sights import Sights
-from mtv_world_ros.physics.solid_foresight import SolidForesight
+from mtv_world_ros.physics.solid_foresight import SolidForesight, table_in
 from mtv_world_ros.robot.file import load_robot, robot_path
 from mtv_world_ros.robot.model import RobotModel
 from mtv_world_ros.robot.shape import load_shape
@@ -196,6 +200,108 @@ def print_grips(arguments: argparse.Namespace) -> None:
         (moves, held), (away, wrong) = counts
         print(f'objects that go along: {moves} frames, {held} of them stops; ', end='')
         print(f'all objects far away: {away} frames, {wrong} of them stops')
+
+
+#: largest brightness of a pixel of a dark gripper; width and height that are looked at [m]
+DARK, BESIDE_M, ALONG_M = 70, 0.07, (0.06, 0.2)
+#: heights of drawn fingers above the table at which they are free, and at which they are in it [m]
+FREE_M, BELOW_M = 0.06, -0.005
+
+
+def print_finger_ends(arguments: argparse.Namespace) -> None:
+    """Print how much farther from the hand fingers are drawn than seen, free and in the table."""
+    folder: Path = arguments.episodes
+    width, height = RECORDED_SIZE
+    spec = WorldModelSpec(
+        views=arguments.views, fps=RECORDED_FPS, num_frames=8, width=width, height=height, robot=''
+    )
+    robot, rows = load_robot(folder / 'robot' / 'robot.yaml'), []
+    arms = Arms(robot, None)
+    scene = CompiledScene.compiled(arms, ())
+    for recording in recordings(folder, spec):
+        motion = motion_of(recording, robot)
+        assert recording.object_ids is not None
+        ids = recording.object_ids[:, :1]
+        masks = masks_from_ids(ids, recording.objects, recording.names).masks[:, :, 0]
+        table_m = table_in(
+            recording.names, masks, recording.cameras, list(motion.camera_poses[:, 0])
+        )
+        spread = arms.drives.spread(recording.positions)
+        above = scene.lowest_fingers(spread)[0] - table_m
+        rotations = robot.tool_poses(recording.positions)[0][:, :3, 2]
+        for view, name in enumerate(arguments.views):
+            row = [recording.path.name, name]
+            for chosen in (above > FREE_M, above < BELOW_M):
+                off = {
+                    t: finger_ends(recording, robot, scene, spread[t], motion, view, t)
+                    for t in map(int, np.flatnonzero(chosen))
+                }
+                found = [(t, d - s) for t, (d, s) in off.items() if np.isfinite(d - s)]
+                if not found:
+                    row += ['0', '-', '-']
+                    continue
+                ends = np.array([gap for _, gap in found])
+                seen = [above[t] - gap * rotations[t, 2] for t, gap in found]
+                low, high = 1e3 * np.quantile(ends, (0.1, 0.9))
+                shown = f'{1e3 * np.median(ends):.0f} [{low:.0f}, {high:.0f}]'
+                row += [str(len(found)), shown, f'{1e3 * np.median(seen):.0f}']
+            rows.append(tuple(row))
+            print('| ' + ' | '.join(rows[-1]) + ' |', flush=True)
+    head = ('free: n', 'drawn beyond seen [mm]', 'seen above the table [mm]')
+    print(table(('recording', 'view', *head, 'in the table: n', *head[1:]), rows))
+
+
+def finger_ends(
+    recording: Recording,
+    robot: RobotModel,
+    scene: CompiledScene,
+    positions: FloatArray,
+    motion: Motion,
+    view: int,
+    t: int,
+) -> tuple[float, float]:
+    """Return how far along the tool's axis fingers are drawn and seen [m]; NaN = out of view.
+
+    Args:
+        recording: the recording.
+        robot: its robot.
+        scene: scene of the robot alone.
+        positions: (D,) positions of the arms [rad or m].
+        motion: motion of the robot and the cameras.
+        view: number of the view.
+        t: number of the frame.
+    """
+    tool = robot.tool_poses(recording.positions[t : t + 1])[0][0]
+    link = tool @ np.linalg.inv(robot.tools[0].T_link_tool)
+    camera, pose = recording.cameras[view], motion.camera_poses[view, t]
+    along = np.arange(ALONG_M[0], ALONG_M[1], 0.001)
+    axis = link[:3, 3] + along[:, None] * tool[:3, 2]
+    aside = np.cross(tool[:3, 2], pose[:3, 3] - axis[len(axis) // 2])
+    beside = np.linspace(-BESIDE_M, BESIDE_M, 85)
+    points = axis[:, None] + beside[:, None] * aside / np.linalg.norm(aside)
+    pixels = project(camera, pose, points.reshape(-1, 3))[0].reshape(*points.shape[:2], 2)
+    middle, (high, wide) = pixels[:, len(beside) // 2], recording.frames.shape[2:4]
+    inside = ((middle > 8) & (middle < [wide - 8, high - 8])).all()
+    if not (inside and np.isfinite(pixels).all()):
+        return nan, nan
+    at = np.float32(pixels)
+    frame = recording.frames[view, t].max(-1).astype(np.float32)
+    dark = cv2.remap(frame, at[..., 0], at[..., 1], cv2.INTER_LINEAR) < DARK
+    _, parts = cv2.connectedComponents(dark.astype(np.uint8))
+    hand = np.unique(parts[:25, 30:55])  # the body of the gripper, and what hangs on it
+    seen = np.isin(parts, hand[hand > 0])
+    drawn = np.zeros((3 * high, 3 * wide), np.float32)
+    for corners in next(scene.finger_shapes(positions[None])):
+        outline = project(camera, pose, corners)[0]
+        if np.isfinite(outline).all():
+            hull = cv2.convexHull(np.float32((outline + 0.5) * 3))
+            cv2.fillConvexPoly(drawn, np.rint(hull).astype(np.int32), 1.0)
+    at = (at + 0.5) * 3 - 0.5
+    drawn_there = cv2.remap(drawn, at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.5
+    in_drawing, in_frame = (np.flatnonzero(found.sum(1) >= 4) for found in (drawn_there, seen))
+    if not (len(in_drawing) and len(in_frame)):
+        return nan, nan
+    return float(along[in_drawing[-1]]), float(along[in_frame[-1]])
 
 
 def motion_of(recording: Recording, robot: RobotModel) -> Motion:
@@ -772,7 +878,8 @@ def main() -> None:
     """Run one of the measurements."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n', 1)[0])
     parser.add_argument(
-        'what', choices=('verdicts', 'grips', 'shares', 'left-out', 'carried', 'rollouts')
+        'what',
+        choices=('verdicts', 'grips', 'fingers', 'shares', 'left-out', 'carried', 'rollouts'),
     )
     parser.add_argument('episodes', type=Path)
     parser.add_argument(
@@ -798,6 +905,7 @@ def main() -> None:
     {
         'verdicts': judge_recorded,
         'grips': print_grips,
+        'fingers': print_finger_ends,
         'shares': shares_over_time,
         'left-out': foresee_left_out,
         'carried': compare_carried,

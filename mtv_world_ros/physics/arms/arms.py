@@ -147,8 +147,9 @@ class Arms:
             own, touches = (0, SOLIDS | PASSED) if arm is None else (
                 bits[arm], SOLIDS + sum(bits) - bits[arm]
             )  # fmt: skip
-            for part in parts:
+            for number, part in enumerate(parts):
                 geom = self._add_part(spec, bodies[joint], part)
+                geom.name = f'{part.link}/{number}'
                 geom.contype, geom.conaffinity = own, touches
                 if self._is_finger(joint, part.link):
                     geom.priority, geom.condim = 1, 4

@@ -5,7 +5,7 @@ Shape letters: O solids, D degrees of freedom of the arms.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
@@ -110,6 +110,7 @@ class CompiledScene:
     _actuators: np.ndarray = field(repr=False)
     _geoms: tuple[np.ndarray, ...] = field(repr=False)
     _bodies: tuple[int, ...] = field(repr=False)
+    _fingers: np.ndarray = field(repr=False)
 
     @classmethod
     def compiled(cls, arms: Arms, kinds: Sequence[str]) -> CompiledScene:
@@ -144,6 +145,7 @@ class CompiledScene:
             _actuators=np.array([model.actuator(name).id for name in arms.drives.names], int),
             _geoms=tuple(np.flatnonzero(model.geom_bodyid == body) for body in bodies),
             _bodies=tuple(bodies),
+            _fingers=np.flatnonzero(model.geom_priority > 0),
         )
 
     def model_of(
@@ -178,6 +180,42 @@ class CompiledScene:
             is_passed = number in passed
             model.geom_contype[geoms] = PASSED if is_passed else SOLIDS
             model.geom_conaffinity[geoms] = SOLIDS | PASSED if is_passed else -1
+
+    def lowest_fingers(self, positions: FloatArray) -> tuple[FloatArray, list[str]]:
+        """Return the height of the lowest point of all fingers, and the link that has it.
+
+        Args:
+            positions: (T, D) positions of the arms [rad or m].
+
+        Returns:
+            (T,) heights [m], and T links; infinite and '' for a robot without fingers.
+        """
+        names = [self.model.geom(geom).name.rpartition('/')[0] for geom in self._fingers]
+        heights, links = np.full(len(positions), np.inf), [''] * len(positions)
+        for row, shapes in enumerate(self.finger_shapes(positions)):
+            for name, corners in zip(names, shapes, strict=True):
+                if corners[:, 2].min() < heights[row]:
+                    heights[row], links[row] = corners[:, 2].min(), name
+        return heights, links
+
+    def finger_shapes(self, positions: FloatArray) -> Iterator[list[FloatArray]]:
+        """Yield the corners (N, 3) of the shapes of all fingers [m], with arms at (T, D)."""
+        data = mujoco.MjData(self.model)
+        for row in positions:
+            data.qpos[self.arm_qpos] = row
+            mujoco.mj_kinematics(self.model, data)
+            yield [self._corners(data, geom) for geom in self._fingers]
+
+    def _corners(self, data: Any, geom: int) -> FloatArray:
+        """Return the corners (N, 3) of a shape [m]; of one that is no mesh those of its box."""
+        model, mesh = self.model, self.model.geom_dataid[geom]
+        if mesh >= 0:
+            first = model.mesh_vertadr[mesh]
+            points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+        else:
+            signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+            points = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
+        return points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
 
     def solid_of(self, geom: int) -> int | None:
         """Return the number of the solid that a shape of the model is a piece of, if any."""

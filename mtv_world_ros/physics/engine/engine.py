@@ -75,7 +75,7 @@ CONTACT_RANGE_M = 0.015
 #: distance at which contact between a finger and the table is simulated [m]
 TABLE_CONTACT_RANGE_M = 0.002
 #: depth to which contact lets an arm reach into a solid; a start at which it is deeper in
-#: contradicts itself, as the cameras are off [m]
+#: contradicts itself, as fingers gave way or cameras are off [m]
 MAX_CONTACT_DEPTH_M = 0.005
 #: wall-clock limit of one plan: SLOWDOWN_LIMIT times its duration plus EXTRA_S; a safeguard only,
 #: because wall time depends on the load of the machine

@@ -42,6 +42,7 @@ from mtv_world_ros.physics.engine.contact_scene import CompiledScene
 from mtv_world_ros.physics.engine.drive_inputs import CoursePlanner, SUBSTEPS
 from mtv_world_ros.physics.engine.engine import Engine
 from mtv_world_ros.physics.engine.futures import Future, shifted
+from mtv_world_ros.physics.fitting.finger_depths import depth_lines, find_finger_depth
 from mtv_world_ros.physics.fitting.stop_trials import observed_stops, ObservedStop, StopTrial
 from mtv_world_ros.physics.fitting.tracks import (
     fine_commands,
@@ -265,6 +266,7 @@ class ContactRecording:
     """Motion of objects in an episode, and the commands that caused it.
 
     Attributes:
+        name: name of the recording.
         names: names of O objects.
         frame: first frame of the recording, with its masks.
         positions: (1 + T * n, J) commanded joint positions, `PERIOD_S` apart [rad or m].
@@ -276,6 +278,7 @@ class ContactRecording:
             measured positions.
     """
 
+    name: str
     names: tuple[str, ...]
     frame: FirstFrame
     positions: FloatArray
@@ -348,6 +351,7 @@ def read_contact(path: Path, robot: RobotModel, views: Sequence[str]) -> Contact
     shown = _unhidden(episode, views, len(displacements))
     recorded = recorded_positions(episode.joint_states, robot, stamps_ns)
     found = ContactRecording(
+        name=path.name,
         names=tuple(episode.info.objects),
         frame=first_frame(episode, robot, views),
         positions=positions,
@@ -479,6 +483,7 @@ def sample_contact(
         }
     )
     first = settings_of_place(first, recordings, report)
+    report_depths(recordings, arms, cameras.value, report)
     trials = [_Trial.of(one, first, arms.robot) for one in recordings]
     if first.squeeze:
         told = [len(trial.stops) for trial in trials]
@@ -612,6 +617,29 @@ def settings_of_place(
             f'by {_FIT.squeeze_fraction:.0%} of their travel'
         )
     return first.model_copy(update=changed)
+
+
+def report_depths(
+    recordings: Sequence[ContactRecording],
+    arms: Arms,
+    camera_m: float,
+    report: Callable[[str], None],
+) -> None:
+    """Report how far measured fingers get below the tables of recordings.
+
+    Args:
+        recordings: the E recordings.
+        arms: arms of the robot.
+        camera_m: error of the cameras [m].
+        report: callback that gets a line of text for each finding.
+    """
+    found = []
+    for one in recordings:
+        positions = one.recorded[::COMMANDS_A_STEP]
+        depth = find_finger_depth(one.name, arms, positions, STEP_S, one.table())
+        found += [] if depth is None else [depth]
+    for line in depth_lines(found, camera_m):
+        report(line)
 
 
 def _scales(first: ContactSettings) -> dict[str, float]:

@@ -19,6 +19,7 @@ from mtv_world_ros.model.checkpoint import checkpoint_folder
 from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.checkpoint_files import CONTACT_FILE, load_contact, load_foresight
 from mtv_world_ros.physics.contact_settings import ContactOrigin
+from mtv_world_ros.physics.engine.contact_scene import CompiledScene
 from mtv_world_ros.physics.engine.engine import Engine
 from mtv_world_ros.physics.fitting import contact_fit
 from mtv_world_ros.physics.fitting.contact_fit import (
@@ -336,3 +337,24 @@ def test_robots_without_inertias_have_numbers_to_begin_with(name):
     found = first_settings(arms)
     assert np.isfinite(found.finger_stiffness) and found.finger_stiffness > 50
     assert any('state no inertia' in note for note in arms.notes)
+
+
+@pytest.mark.parametrize('deep_m', [0.0, 0.03])
+def test_a_fit_says_how_far_fingers_are_below_the_table_of_the_objects(
+    robot, response, recording, deep_m
+):
+    """Cameras that see all by as much too high draw fingers as far below the table."""
+    arms, said = Arms(robot, response), list[str]()
+    lowest = arms.drives.spread(recording.recorded[::10])
+    height_m = CompiledScene.compiled(arms, ()).lowest_fingers(lowest)[0].min()
+    poses = [np.array(pose) for pose in recording.frame.poses]
+    for pose in poses:
+        pose[2, 3] += height_m + deep_m
+    off = replace(recording, frame=replace(recording.frame, poses=tuple(poses)))
+    contact_fit.report_depths([off, recording], arms, 0.001, said.append)
+    if not deep_m:
+        assert not said
+        return
+    depth_mm = float(re.search(r'\[mm\]: \S+ (\d+) \(at', said[0]).group(1))
+    assert depth_mm == pytest.approx(1e3 * deep_m, abs=2)
+    assert '1 of 2 recordings' in said[0] and 'run mtv-world fit camera again' in said[1]
