@@ -24,6 +24,7 @@ from mtv_world_ros.simulation.expert.expert import Expert
 from mtv_world_ros.simulation.opengl import missing_opengl
 from mtv_world_ros.simulation.scenes.workcell import workcell_of
 from test.support.left_behind import left, restore, state
+from test.support.ros_domain import claim_domain
 from test.support.tiers import file_seconds, tier_lines
 
 
@@ -72,6 +73,11 @@ MOST_LISTED = 5
 INTERFACES = Path(sys.prefix) / 'interfaces'
 if INTERFACES.is_dir():
     sys.path.append(str(INTERFACES))
+
+
+# nodes that tests and commands start meet no node of another test process
+os.environ['ROS_DOMAIN_ID'] = str(claim_domain())
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
 @pytest.fixture(scope='session')

@@ -156,8 +156,6 @@ def at_the_desk(desk, monkeypatch):
     monkeypatch.syspath_prepend(desk)
     packages = [str(desk), str(PAGE.parents[1]), os.environ.get('PYTHONPATH', '')]
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(filter(None, packages)))
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     return desk
 
 
@@ -272,8 +270,6 @@ def test_recordings_of_videos_run_offline_imagined_judged_and_through_the_node(
     if not checkpoint.is_dir():
         pytest.skip('the page was not run until here')
     monkeypatch.chdir(folder)
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     routes = [words for words in lines(of_videos=True) if is_route(words)]
     offline, imagine, serve, play = routes
     for words in (offline, imagine):

@@ -38,10 +38,7 @@ def launch(tmp_path):
     found = subprocess.run(['ros2', 'pkg', 'prefix', 'mtv_world_ros'], capture_output=True)
     if found.returncode != 0:
         pytest.skip('mtv_world_ros is not built by colcon and sourced')
-    domain = str(1 + os.getpid() % 100)
-    environment = {
-        **os.environ, 'ROS_DOMAIN_ID': domain, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-    }  # fmt: skip
+    environment = dict(os.environ)
 
     started = []
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+from functools import cache
 import os
 from pathlib import Path
 import tempfile
@@ -13,8 +14,9 @@ LAST_DOMAIN = 101
 _held: list[int] = []
 
 
+@cache
 def claim_domain() -> int:
-    """Return a free domain, which stays this process' own until it ends."""
+    """Return this process' own domain, which was free and stays its own until the end."""
     folder = Path(tempfile.gettempdir()) / f'mtv_world_domains_{os.getuid()}'
     folder.mkdir(exist_ok=True)
     first = os.getpid()  # a process that knows no locks may be at the low numbers
