@@ -141,6 +141,14 @@ def imported_demo(exported_demo: Path, tmp_path_factory: pytest.TempPathFactory)
     return out
 
 
+@pytest.fixture(autouse=True, scope='session')
+def no_loading_line() -> Iterator[None]:
+    """A command in this process does not say that it is loading, however busy the machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('mtv_world_ros.cli._FIRST_LINE_S', 3600.0)
+        yield
+
+
 @pytest.fixture(autouse=True, scope='module')
 def nothing_left_behind() -> Iterator[None]:
     """The next file of tests of the process finds it as this one did, whichever that is.
