@@ -254,10 +254,13 @@ def test_a_command_that_still_loads_says_so_until_it_shows_its_progress(capsys, 
     monkeypatch.setattr('mtv_world_ros.cli._NEXT_LINE_S', 0.06)
 
     def work(_):
-        time.sleep(0.5)
+        said, end_s = '', time.monotonic() + 60.0
+        while said.count('\n') < 2 and time.monotonic() < end_s:
+            time.sleep(0.05)
+            said += capsys.readouterr().err
         with Progress(total=1):
-            time.sleep(0.1)  # a line may be on its way
-            told.append(capsys.readouterr().err)
+            time.sleep(0.5)  # a line may be on its way
+            told.append(said + capsys.readouterr().err)
             time.sleep(0.3)
         return 0
 

@@ -51,17 +51,9 @@ def written_at(out: Path) -> int:
         return 0
 
 
-def stopped_while_saving(child: int, out: Path) -> bool:
-    """Stop a process that writes its state; one that has written it meanwhile goes on."""
-    if not any(out.glob('.state.mtv-new-*')):
-        return False
-    os.kill(child, signal.SIGSTOP)
-    _, status = os.waitpid(child, os.WUNTRACED)
-    assert os.WIFSTOPPED(status), status
-    if any(out.glob('.state.mtv-new-*')):
-        return True
-    os.kill(child, signal.SIGCONT)
-    return False
+def is_saving(out: Path) -> bool:
+    """Whether the state is being written."""
+    return any(out.glob('.state.mtv-new-*'))
 
 
 def kill(child: int, out: Path, *, saving: bool, after: float) -> str | None:
@@ -72,10 +64,20 @@ def kill(child: int, out: Path, *, saving: bool, after: float) -> str | None:
             return None
         time.sleep(0.001)
     time.sleep(after)
-    while saving and not stopped_while_saving(child, out):
-        if finished(child):
+    while not finished(child):
+        if not saving:
+            break
+        if not is_saving(out):
+            continue
+        os.kill(child, signal.SIGSTOP)
+        _, status = os.waitpid(child, os.WUNTRACED)
+        if not os.WIFSTOPPED(status):  # it ended meanwhile
+            assert status == 0, status
             return None
-    if finished(child):
+        if is_saving(out):  # still, and it stands still
+            break
+        os.kill(child, signal.SIGCONT)
+    else:
         return None
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
