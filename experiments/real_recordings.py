@@ -284,7 +284,7 @@ def finger_ends(
     inside = ((middle > 8) & (middle < [wide - 8, high - 8])).all()
     if not (inside and np.isfinite(pixels).all()):
         return nan, nan
-    at = np.float32(pixels)
+    at = pixels.astype(np.float32)
     frame = recording.frames[view, t].max(-1).astype(np.float32)
     dark = cv2.remap(frame, at[..., 0], at[..., 1], cv2.INTER_LINEAR) < DARK
     _, parts = cv2.connectedComponents(dark.astype(np.uint8))
@@ -294,7 +294,7 @@ def finger_ends(
     for corners in next(scene.finger_shapes(positions[None])):
         outline = project(camera, pose, corners)[0]
         if np.isfinite(outline).all():
-            hull = cv2.convexHull(np.float32((outline + 0.5) * 3))
+            hull = cv2.convexHull(((outline + 0.5) * 3).astype(np.float32))
             cv2.fillConvexPoly(drawn, np.rint(hull).astype(np.int32), 1.0)
     at = (at + 0.5) * 3 - 0.5
     drawn_there = cv2.remap(drawn, at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.5
