@@ -28,6 +28,7 @@ def moved(ros, view, pixels):
 
 
 def send_images(node, ros, client, stamp_ns, shift):
+    client.wait(lambda: time.time_ns() >= stamp_ns)  # images of the future are refused
     for view in ros.VIEWS:
         message = ros.make_image(view, stamp_ns)
         message.data = moved(ros, view, shift).tobytes()
