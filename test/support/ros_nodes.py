@@ -1,6 +1,7 @@
 """Nodes in the process of a test or in their own, and a client that talks to them."""
 
 from collections import Counter, defaultdict
+from contextlib import suppress
 import json
 import os
 from pathlib import Path
@@ -216,6 +217,27 @@ class Client:
         while not condition():
             assert time.monotonic() < end, f'waited {timeout_s} s for {what}'
             self._spin_once()
+
+    def hear(self, process, kind, topic):
+        """Subscribe to a topic of a node in this process, and wait until that node knows it.
+
+        That a participant knows a publisher does not mean that the publisher knows its reader.
+        A reader that it does not know for long is made anew: discovery may have lost it.
+        """
+
+        def is_known():
+            found = [p for p in process.node.publishers if p.topic_name == topic]
+            return bool(found) and all(p.get_subscription_count() for p in found)
+
+        self.wait(lambda: getattr(process, 'node', None), 'the node')
+        end = time.monotonic() + TIMEOUT_S
+        self.subscribe(kind, topic)
+        while not is_known():
+            assert time.monotonic() < end, f'{topic} does not know its reader'
+            with suppress(AssertionError):
+                self.wait(is_known, topic, MATCH_AGAIN_S)
+                return
+            self.subscribe(kind, topic)
 
     def wait_until_seen(self, process, stamp_ns):
         """Wait until a node in this process has the images of a moment, of all views.

@@ -604,12 +604,9 @@ def test_two_robots_and_two_players_do_not_meet(episode, launch, tmp_path, ros, 
             folder, 'pace:=burst', 'compressed_input:=true', 'use_sim_time:=true',
             f'seed:={100 + len(heard)}', remaps=(f'__ns:=/{name}', '/clock:=clock'),
         )  # fmt: skip
-        client.subscribe(ros.REPORT, f'/{name}/world_model/report', 100)
     try:
         for name in heard:
-            client.wait(
-                lambda n=name: client.node.count_publishers(f'/{n}/world_model/report'), name, 60
-            )
+            client.hear(heard[name], ros.REPORT, f'/{name}/world_model/report')
         spaces = [('--ros-args', '-r', f'__ns:=/{name}') for name in heard]
         first, second = (
             launch('player', episode, '--clock', '--lock-step', '--rate', rate, *space)
