@@ -21,9 +21,10 @@ follow, which somebody compares with the frames (--out has pictures of each stop
 simulated episodes it counts the frames in which an object goes along with a tool, and in which all
 are far from it, with the stops among them. `fingers` compares where a dark gripper ends in the
 pictures with where it is drawn, along the tool's axis, with the fingers free and drawn below the
-table; only frames in which nothing else beside the gripper is dark say something. `shares` foresees the rest of a recording from later
-and later frames, by the masks of the import, and prints the share of futures in which the task
-succeeds, with and without the memory of what frames before showed; no picture is imagined.
+table; only frames in which nothing else beside the gripper is dark say something. `shares`
+foresees the rest of a recording from later and later frames, by the masks of the import, and
+prints the share of futures in which the task succeeds, with and without the memory of what frames
+before showed; no picture is imagined.
 `left-out` does so with numbers of contact that are fitted on the other recordings, prints the
 verdict of the futures (the share of futures with its 95 % interval, no calibration and no
 picture), and draws the shares over time of all recordings; run again, it goes on where it

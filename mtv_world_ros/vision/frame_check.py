@@ -89,10 +89,10 @@ def check_frames(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StillPictures:
-    """What each of V cameras has shown since its picture changed last.
+    """The picture of each camera, unchanged for a time, and the joint motion in that time.
 
     Attributes:
-        frames: (V, H, W, 3) uint8 RGB, the first picture of that kind.
+        frames: (V, H, W, 3) uint8 RGB, when the picture changed last.
         low: (V, J) smallest joint positions since then [rad or m].
         high: (V, J) largest ones.
         still_s: (V,) time since then [s].

@@ -231,13 +231,12 @@ class Client:
 
         self.wait(lambda: getattr(process, 'node', None), 'the node')
         end = time.monotonic() + TIMEOUT_S
-        self.subscribe(kind, topic)
-        while not is_known():
-            assert time.monotonic() < end, f'{topic} does not know its reader'
+        while True:
+            self.subscribe(kind, topic)
             with suppress(AssertionError):
                 self.wait(is_known, topic, MATCH_AGAIN_S)
                 return
-            self.subscribe(kind, topic)
+            assert time.monotonic() < end, f'{topic} does not know its reader'
 
     def wait_until_seen(self, process, stamp_ns):
         """Wait until a node in this process has the images of a moment, of all views.

@@ -160,9 +160,8 @@ class CompiledScene:
         """
         model = copy(self.model)
         set_drives(model, self.arms.drives, settings, self._actuators, self.arm_dofs)
-        is_finger = model.geom_priority > 0
         model.geom_friction[:, 0] = settings.table_friction
-        model.geom_friction[is_finger, 0] = settings.grip_friction
+        model.geom_friction[self._fingers, 0] = settings.grip_friction
         model.geom_friction[:, 1] = PATCH_M
         model.geom_pos[0, 2] = settings.table_m
         model.geom_conaffinity[0] = SOLIDS | PASSED if settings.table_varies else -1

@@ -633,10 +633,10 @@ def report_depths(
         camera_m: error of the cameras [m].
         report: callback that gets a line of text for each finding.
     """
-    found = []
+    scene, found = CompiledScene.compiled(arms, ()), []
     for one in recordings:
         positions = one.recorded[::COMMANDS_A_STEP]
-        depth = find_finger_depth(one.name, arms, positions, STEP_S, one.table())
+        depth = find_finger_depth(one.name, scene, positions, STEP_S, one.table())
         found += [] if depth is None else [depth]
     for line in depth_lines(found, camera_m):
         report(line)

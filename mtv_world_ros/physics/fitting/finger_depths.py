@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from mtv_world_ros.core.data_types import FloatArray
-from mtv_world_ros.physics.arms.arms import Arms
 from mtv_world_ros.physics.engine.contact_scene import CompiledScene
 
 #: smallest depth that is no error of the outlines that show the table [m]
@@ -41,19 +40,18 @@ class FingerDepth:
 
 
 def find_finger_depth(
-    recording: str, arms: Arms, positions: FloatArray, period_s: float, table_m: float
+    recording: str, scene: CompiledScene, positions: FloatArray, period_s: float, table_m: float
 ) -> FingerDepth | None:
     """Return the deepest place of the fingers of a recording; None = no table, or no fingers.
 
     Args:
         recording: name of the recording.
-        arms: arms of the robot.
+        scene: scene of the robot alone.
         positions: (T, J) measured joint positions [rad or m].
         period_s: time between two rows [s].
         table_m: height of the table as objects show it [m]; NaN = not known.
     """
-    scene = CompiledScene.compiled(arms, ())
-    heights, links = scene.lowest_fingers(arms.drives.spread(positions))
+    heights, links = scene.lowest_fingers(scene.arms.drives.spread(positions))
     row = int(heights.argmin())
     if not np.isfinite(table_m - heights[row]):
         return None

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.physics.arms.arms import Arms
+from mtv_world_ros.physics.engine.contact_scene import CompiledScene
 from mtv_world_ros.physics.fitting.finger_depths import depth_lines, find_finger_depth
 
 #: heights of the hand in rows .1 s apart; its fingers end 15 mm below it [m]
@@ -12,7 +13,8 @@ HEIGHTS = np.array([0.1, 0.05, 0.02, 0.05])
 
 def depth_of(lift, name='0001', table_m=0.0):
     positions = np.stack([HEIGHTS, np.full(len(HEIGHTS), 0.04)], -1)
-    return find_finger_depth(name, Arms(lift, None), positions, 0.1, table_m)
+    scene = CompiledScene.compiled(Arms(lift, None), ())
+    return find_finger_depth(name, scene, positions, 0.1, table_m)
 
 
 def test_fingers_that_end_below_the_table_are_named_with_their_depth(lift):
