@@ -53,8 +53,14 @@ test-all: test slow-tests  ## the linters and all tests (20 minutes)
 fast-tests: $(DEV) $(INTERFACES)
 	$(PYTEST) -m 'not slow'
 
+# of the slow tests' many processes one may be late on a busy machine: what fails runs once more, alone,
+# with its whole file, and both results are printed
+FAILED := .pytest_cache/v/cache/lastfailed
 slow-tests: $(DEV) $(INTERFACES)  ## the tests that `make test` leaves out
-	$(PYTEST) -m slow
+	@rm -f $(FAILED)
+	$(PYTEST) -m slow || { [ $$? = 1 ] && echo "Failed above; once more, alone:" && \
+		files=$$($(BIN)/python -c 'import json; print(*{n.partition("::")[0] for n in json.load(open("$(FAILED)"))})') && \
+		OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -v --maxfail 1 $$files; }
 
 tiers: $(DEV) $(INTERFACES)  ## time all tests, one by one; list those whose marker `slow` is wrong
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q --tiers

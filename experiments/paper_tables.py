@@ -7,12 +7,15 @@ makes the data of the fifteen tasks (half of the episodes for training, half for
 commands and with those of another episode, and writes `tables.md` after each row. `--clips` names
 the stages: all rows are trained and evaluated with one number before any goes on to the next.
 The same command goes on where it was stopped. Stages, rows, seeds and weights for FID and FVD may
-be added later. Several processes may share a folder: each takes the rows that no other works on.
+be added later: `--seeds 0,1 --rows ee_mlp,mtv_world` trains these two rows a second time, and the
+tables then have both. Several processes may share a folder: each takes the rows that no other
+works on.
 
 Rows are tested on whole episodes from their first frame, as in the paper, and also chunk by chunk
 from recorded frames, which is named so. `--rates` trains each row with several learning rates for
-`--rate-clips` clips first and goes on with the best: the one with the lowest loss at the end, in
-less than one pass of the clips, so that the loss is of clips that were not seen before.
+`--rate-clips` clips first, with the first seed, and goes on with the best: the one with the lowest
+loss at the end, in less than one pass of the clips, so that the loss is of clips that were not
+seen before.
 
 Tables 1 to 3 are those of the last stage that all rows have; a learning curve shows all stages.
 The learning rate is constant after a short warm-up, so that a stage does not depend on those after
@@ -104,7 +107,7 @@ METHODS = {
     'fast_tokens': 'version 2: tested on whole episodes',
     TRAJECTORY_VIDEO: 'version 2: tested on whole episodes',
 }
-METHOD = 'method.json'
+METHOD, RATES = 'method.json', 'rates.json'
 #: settings of a method beyond the preset, as its authors have it: Ctrl-World's history and
 #: guidance. It has six history frames; eight are the next number of whole tokens of four frames
 METHOD_SETTINGS = {
@@ -506,20 +509,34 @@ class PaperTables:
 
     def _find_rate(self, row: Row, seed: int, label: str) -> float | None:
         """Return the learning rate of a row; None = the preset's. Trains with each where asked."""
-        rates, clips = self.options.rates, self.options.rate_clips
+        rates, first = self.options.rates, self.folder(row, self.seeds[0])
         if not rates or row.starts_from:
             return None
+        if seed != self.seeds[0]:
+            first.mkdir(parents=True, exist_ok=True)
+            with locked(first):  # another process may try them
+                return self._tried_rate(row, label)
+        rate, training = self._tried_rate(row, label), first / 'training'
+        if (best := first / f'rate_{rate:g}').is_dir() and not training.is_dir():
+            best.rename(training)  # the rate is constant, so these are the first clips of the row
+        return rate
+
+    def _tried_rate(self, row: Row, label: str) -> float:
+        """Return the rate of `--rates` with the lowest loss; train with those not tried so far."""
+        seed, clips = self.seeds[0], self.options.rate_clips
+        folder = self.folder(row, seed)
+        if (file := folder / RATES).is_file():
+            return float(read_json(file)['rate'])
         losses = {}
-        for rate in rates:
-            folder = self.folder(row, seed) / f'rate_{rate:g}'
+        for rate in self.options.rates:
+            out = folder / f'rate_{rate:g}'
             self._command(
-                f'{label}: training', self._training(row, seed, clips, rate, folder),
-                done=trained_steps(folder / self.product) == self.steps(clips),
-                times=self.folder(row, seed),
+                f'{label}: training', self._training(row, seed, clips, rate, out),
+                done=trained_steps(out / self.product) == self.steps(clips), times=folder,
             )  # fmt: skip
-            losses[rate] = last_loss(folder)
+            losses[rate] = last_loss(out)
         best = min(losses, key=lambda rate: losses[rate])
-        write_json(self.folder(row, seed) / 'rates.json', {'losses': losses, 'rate': best})
+        write_json(file, {'losses': losses, 'rate': best})
         return best
 
     def _training(
@@ -807,8 +824,8 @@ class Results:
         }
 
     def has(self, row: Row) -> bool:
-        """Return True if a row is tested with all seeds."""
-        return len(self.evaluations(row.name)) == len(self._seeds)
+        """Return True if a row is tested with the first seed; others may have fewer rows."""
+        return (row.name, self._seeds[0], WHOLE) in self._read
 
     def evaluations(self, name: str, test: str = 'test') -> list[EvaluationSummary]:
         """Return the evaluations of a row, one a seed."""
@@ -961,12 +978,17 @@ class Results:
         return [str(whole.num_episodes or DASH), *cells, says if isfinite(whole.value) else DASH]
 
     def difference(self, better: str, worse: str, view: str, key: str) -> Estimate:
-        """Return the mean difference of two rows over the episodes that both have."""
-        held: list[dict[tuple[int, str], float]] = []
+        """Return the mean difference of two rows over the episodes that both have.
+
+        Of a row with several seeds an episode has the mean over its seeds.
+        """
+        held: list[dict[str, float]] = []
         for name in (better, worse):
-            found = [(seed, r) for seed in self._seeds if (name, seed, 'test') in self._read
-                     for r in self._read[name, seed, 'test'].results]  # fmt: skip
-            held.append({(seed, r.episode): r.means(view).get(key, nan) for seed, r in found})
+            by_episode: dict[str, list[float]] = {}
+            for evaluated in self.evaluations(name):
+                for r in evaluated.results:
+                    by_episode.setdefault(r.episode, []).append(r.means(view).get(key, nan))
+            held.append({episode: float(np.mean(of)) for episode, of in by_episode.items()})
         both = [held[0][k] - held[1][k] for k in held[0] if k in held[1]]
         values = np.array([value for value in both if isfinite(value)])[:, None]
         if not len(values):

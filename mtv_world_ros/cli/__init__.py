@@ -335,8 +335,9 @@ def _say_loading(name: str, done: threading.Event) -> None:
 
 
 def _num_progresses() -> int:
-    progress = sys.modules.get('mtv_world_ros.core.progress')  # importing it may wait for others
-    return progress.Progress.num_shown if progress else 0
+    # importing the module here may wait for others; while they import it the class is missing
+    progress = getattr(sys.modules.get('mtv_world_ros.core.progress'), 'Progress', None)
+    return progress.num_shown if progress else 0
 
 
 @contextmanager

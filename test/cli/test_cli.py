@@ -9,12 +9,13 @@ from pathlib import Path
 import subprocess
 import sys
 import time
+from types import ModuleType
 
 import cv2
 import numpy as np
 import pytest
 
-from mtv_world_ros.cli import imagine, main
+from mtv_world_ros.cli import _num_progresses, imagine, main
 from mtv_world_ros.cli.commands import REMOVED_OPTIONS
 from mtv_world_ros.core.files import share_path
 from mtv_world_ros.core.progress import Progress
@@ -271,6 +272,13 @@ def test_a_command_that_still_loads_says_so_until_it_shows_its_progress(capsys, 
     assert first == 'mtv-world: replay: loading'
     assert second.startswith('mtv-world: replay: loading, ') and second.endswith(' s so far')
     assert capsys.readouterr().err == ''
+
+
+def test_a_module_that_another_thread_still_imports_shows_no_progress(monkeypatch):
+    assert _num_progresses() == Progress.num_shown
+    half = ModuleType('mtv_world_ros.core.progress')  # without the class, as while it is imported
+    monkeypatch.setitem(sys.modules, half.__name__, half)
+    assert _num_progresses() == 0
 
 
 def test_a_player_does_not_load_while_it_plays(capsys, monkeypatch):

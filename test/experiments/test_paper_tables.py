@@ -515,6 +515,25 @@ def test_the_order_of_two_rows_is_told_from_episodes_that_both_have(
     assert verdicts(still)[pair][-1] == 'neither reacts'
 
 
+def test_an_episode_of_a_row_with_two_seeds_is_one_episode_of_a_difference(
+    tables: ModuleType, tmp_path: Path
+):
+    words = ['--out', str(tmp_path), '--seeds', '0,1']
+    found = tables.Results(tables.PaperTables(tables.parser().parse_args(words)), 500)
+    found._read = {
+        ('without_mask', 0, 'test'): evaluated({'a': 0.5, 'b': 0.6}, True),
+        ('mtv_world', 0, 'test'): evaluated({'a': 0.6, 'b': 0.6}, True),
+        ('mtv_world', 1, 'test'): evaluated({'a': 0.8, 'b': 0.8}, True),
+    }
+    rows = {row.name: row for row in tables.ROWS}
+    assert found.has(rows['without_mask']) and found.has(rows['mtv_world'])
+    assert not found.has(rows['ee_mlp'])
+    gain = found.difference('mtv_world', 'without_mask', 'low', 'j_union')
+    assert gain.num_episodes == 2 and gain.value == pytest.approx((0.2 + 0.1) / 2)
+    del found._read['mtv_world', 0, 'test']
+    assert not found.has(rows['mtv_world'])
+
+
 def test_real_recordings_are_split_three_to_one(
     tables: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -566,10 +585,27 @@ def test_the_learning_rate_with_the_lowest_loss_is_taken(tables, data: Path, tmp
         return 0
 
     options = tables.parser().parse_args(
-        words_of(tmp_path, data, ROWS, '--rates', '3e-4,6e-4,1.2e-3', '--rate-clips', '2')
+        words_of(
+            tmp_path,
+            data,
+            ROWS,
+            '--rates',
+            '3e-4,6e-4,1.2e-3',
+            '--rate-clips',
+            '2',
+            '--seeds',
+            '0,1',
+        )
     )
     run = tables.PaperTables(options, train)
     row = next(row for row in tables.ROWS if row.name == 'mtv_world')
+    first, second = run.folder(row, 0), run.folder(row, 1)
     assert run._find_rate(row, 0, 'mtv_world') == 0.0006
+    assert sorted(p.name for p in first.glob('rate_*')) == ['rate_0.0003', 'rate_0.0012']
+    assert json.loads((first / 'training' / 'log.jsonl').read_text().split('\n')[0])['loss'] == 0.2
+    # the second seed takes the rate of the first, and nothing is tried again
+    losses.clear()
+    assert run._find_rate(row, 0, 'mtv_world') == run._find_rate(row, 1, 'mtv_world') == 0.0006
+    assert not second.exists()
     words = run._training(row, 0, 4, 0.0006)
     assert '--set=optimizer.learning_rate=0.0006' in words
