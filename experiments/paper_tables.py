@@ -277,6 +277,9 @@ class PaperTables:
         """Do what no other process works on; return the rest."""
         busy = []
         for stage, seed, row in left:
+            if self._waits(row, seed):
+                busy.append((stage, seed, row))
+                continue
             folder = self.folder(row, seed)
             folder.mkdir(parents=True, exist_ok=True)
             try:
@@ -299,6 +302,9 @@ class PaperTables:
         self._check_adapters()
         for row in self.rows:
             control_class(row.control)
+            for seed in self.seeds:
+                if row.starts_from and not self._waits(row, seed):
+                    self._start(row, seed)
         if options.fid_weights is not None:
             frame_features(options.fid_weights)
         if options.fvd_weights is not None:
@@ -584,6 +590,14 @@ class PaperTables:
                 values = read_json(self.options.init / card)
                 write_json(new / card, {**values, 'views': list(views)})
         return folder
+
+    def _waits(self, row: Row, seed: int) -> bool:
+        """Whether a row starts from weights that this run has still to train."""
+        source = next((one for one in self.rows if one.name == row.starts_from), None)
+        if source is None or self.options.real_init not in self.stages:
+            return False
+        made = self.stage_folder(source, seed, self.options.real_init) / self.product
+        return trained_steps(made) is None
 
     def _start(self, row: Row, seed: int) -> Path:
         """Return the checkpoint that a row starts from.

@@ -380,7 +380,7 @@ def test_rows_that_cannot_be_trained_are_refused(tables: ModuleType, rows: str, 
 
 
 def test_a_row_that_starts_from_another_needs_its_stage(
-    tables: ModuleType, data: Path, tmp_path: Path
+    tables: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     name = 'real_mtv_world_after_simulation'
     words = ['--out', str(tmp_path), '--data', str(data), '--clips', '8', '--real', str(data),
@@ -395,6 +395,17 @@ def test_a_row_that_starts_from_another_needs_its_stage(
     assert last.name == name
     with pytest.raises(ConfigError, match=r"'mtv_world' with 8 clips .* not trained so far"):
         run._training(last, 0, 8)
+
+    # in this run it waits for that stage; where no row of the run will have it nothing begins
+    run._check_before()
+    begun = []
+    monkeypatch.setattr(run, '_do_stage', lambda row, seed, stage: begun.append(row.name))
+    assert run._try([(8, 0, last), (8, 0, run.rows[0])]) == [(8, 0, last)]
+    assert begun == [run.rows[0].name]
+    for more in (['--rows', name], ['--clips', '4']):
+        options = tables.parser().parse_args([*words, '--real-init', '8', *more])
+        with pytest.raises(ConfigError, match='not trained so far'):
+            tables.PaperTables(options)._check_before()
 
 
 def test_weights_of_another_network_are_refused_before_anything_is_trained(
