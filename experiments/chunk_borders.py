@@ -10,6 +10,8 @@ control shows the masks of the first frame:
 - `lost`: an object that is not found keeps its last mask.
 - `carried`: as `lost`; and an object of which less than `VISIBLE` of its last whole mask shows
   gets that whole mask, placed where it covers the visible part best.
+- `stays`: as `carried`; and an object keeps its last whole mask where the picture under that mask
+  is still the same, whatever is found elsewhere: an object cannot be at two places.
 
 Whole episodes are imagined with their own commands. Printed are J of moving objects and the
 differences from `found`, paired by episode, with 95 % t intervals. The same command goes on.
@@ -24,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtv_world_ros.core.data_types import BoolArray, ObjectMasks
+from mtv_world_ros.core.data_types import BoolArray, ByteArray, ObjectMasks
 from mtv_world_ros.core.documents import DASH, Table
 from mtv_world_ros.data.splits import EVERY, select
 from mtv_world_ros.evaluation.evaluate_episodes import evaluate
@@ -37,11 +39,13 @@ from mtv_world_ros.rollout.options import RolloutOptions
 from mtv_world_ros.rollout.pipeline import Pipeline
 from mtv_world_ros.rollout.state import RolloutState
 
-FOUND, LOST, CARRIED = VARIANTS = ('found', 'lost', 'carried')
+FOUND, LOST, CARRIED, STAYS = VARIANTS = ('found', 'lost', 'carried', 'stays')
 #: an object of which less shows is taken to be partly hidden [fraction of its last whole mask]
 VISIBLE = 0.8
 #: least part of the visible pixels that the placed mask covers [fraction]
 AGREEMENT = 0.7
+#: greatest median difference under a mask by which a picture is the same, of 255
+SAME = 10.0
 #: what a pixel of displacement costs, against covered pixels; breaks ties alone
 _DISPLACEMENT_COST = 1e-3
 
@@ -53,10 +57,12 @@ class RememberingPipeline(Pipeline):
     Attributes:
         variant: one of `VARIANTS`.
         whole: last whole masks (V, O, H, W), by name `whole`, and the last ones, `last`.
+        seen: start frames (V, O, H, W, 3) of the last whole masks, by name `frames`.
     """
 
     variant: str = FOUND
     whole: dict[str, BoolArray] = field(default_factory=dict)
+    seen: dict[str, ByteArray] = field(default_factory=dict)
 
     @classmethod
     def of(cls, pipeline: Pipeline, variant: str) -> RememberingPipeline:
@@ -67,9 +73,10 @@ class RememberingPipeline(Pipeline):
     def find(self, state: RolloutState, options: RolloutOptions) -> ObjectMasks:
         """Return masks of the frame that a chunk starts from (T = 1)."""
         found = Pipeline.find(self, state, options)
-        first = found.masks[:, :, 0]
+        first, frames = found.masks[:, :, 0], state.observation.frames
         if not state.num_imagined:
             self.whole.update(whole=first.copy(), last=first.copy())
+            self.seen['frames'] = np.repeat(frames[:, None], first.shape[1], 1)
             return found
         if self.variant == FOUND:
             return found
@@ -77,8 +84,24 @@ class RememberingPipeline(Pipeline):
         followed = None if state.followed is None else state.followed.masks.masks[:, :, 0]
         for index in np.ndindex(*first.shape[:2]):
             tracked = None if followed is None else followed[index]
+            if self.variant == STAYS and self._stays(frames[index[0]], index):
+                shown[index] = self.whole['whole'][index]
+                self.whole['last'][index] = shown[index]
+                continue
             shown[index] = self._remembered(first[index], tracked, index)
+            if shown[index] is first[index] or (shown[index] == self.whole['whole'][index]).all():
+                self.seen['frames'][index] = frames[index[0]]
         return replace(found, masks=shown[:, :, None])
+
+    def _stays(self, frame: ByteArray, index: tuple[int, ...]) -> bool:
+        """Whether the picture under an object's last whole mask is what it was."""
+        whole = self.whole['whole'][index]
+        if not whole.any():
+            return False
+        now, then = (
+            picture[whole].astype(float) for picture in (frame, self.seen['frames'][index])
+        )
+        return float(np.median(np.abs(now - then).max(-1))) < SAME
 
     def _remembered(
         self, mask: BoolArray, followed: BoolArray | None, index: tuple[int, ...]
@@ -123,9 +146,9 @@ def _moved(points: np.ndarray, shape: tuple[int, ...]) -> BoolArray:
     return mask
 
 
-def moving_jaccard(summary: EvaluationSummary) -> dict[str, float]:
+def moving_jaccard(summary: EvaluationSummary, key: str = 'j_moving') -> dict[str, float]:
     """Return J of moving objects by episode; NaN where nothing moves."""
-    return {result.episode: result.means(None)['j_moving'] for result in summary.results}
+    return {result.episode: result.means(None)[key] for result in summary.results}
 
 
 def differences(scores: dict[str, dict[str, float]]) -> list[tuple[str, ...]]:
@@ -151,18 +174,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     checkpoint = Checkpoint.open(options.checkpoint)
     pipeline = Pipeline.load(checkpoint, num_threads=1)
-    scores = {}
+    summaries = {}
     for variant in VARIANTS:
-        summary = evaluate(
+        summaries[variant] = evaluate(
             RememberingPipeline.of(pipeline, variant),
             select(options.dataset, EVERY, None).paths,
             options.out / variant,
             EvaluationConfig(mode='imagine', actions=('true',), ceiling=False),
             name=f'{variant}: {fingerprint(checkpoint)}',
         )
-        scores[variant] = moving_jaccard(summary)
-    head = ('masks at a border', 'episodes', 'J of moving objects', 'difference')
-    print(Table(head=head, rows=tuple(differences(scores))).markdown())
+    for key, words in (('j_moving', 'truth'), ('j_moving_either', 'truth or imagination')):
+        scores = {variant: moving_jaccard(found, key) for variant, found in summaries.items()}
+        head = ('masks at a border', 'episodes', f'J, moves in {words}', 'difference')
+        print(Table(head=head, rows=tuple(differences(scores))).markdown(), end='\n\n')
+    for variant, found in summaries.items():
+        print(f'{variant}: {found.dreams.line}')
 
 
 if __name__ == '__main__':
