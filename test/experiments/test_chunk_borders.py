@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,6 +37,22 @@ def test_a_shape_that_agrees_with_no_place_is_not_drawn(borders):
     whole = rectangle(2, 3, 2, 2)
     visible = rectangle(5, 2, 1, 18)
     np.testing.assert_array_equal(borders.placed(whole, visible), visible)
+
+
+def test_an_object_stays_where_most_of_the_picture_under_its_mask_is_the_same(borders):
+    then = np.full((20, 24, 3), 100, np.uint8)
+    memory = SimpleNamespace(
+        whole={'whole': rectangle(2, 3, 4, 5)[None, None]}, seen={'frames': then[None, None]}
+    )
+    now = then.copy()
+    now[10:] = 0  # elsewhere
+    now[2:3, 3:8] = 200  # a quarter of it
+    stays = borders.RememberingPipeline._stays
+    assert stays(memory, now, (0, 0))
+    now[3:5, 3:8] = 200
+    assert not stays(memory, now, (0, 0))
+    memory.whole['whole'][:] = False
+    assert not stays(memory, then, (0, 0))  # never seen
 
 
 def test_differences_are_paired_by_episode_and_leave_out_what_does_not_move(borders):
