@@ -50,21 +50,17 @@ test: style  ## the linters and the fast tests (5 minutes)
 
 test-all: test slow-tests  ## the linters and all tests (20 minutes)
 
-# a test of many processes may be late once on a busy machine: what fails runs once more, alone, with its
-# whole file, and both results are printed; what fails twice fails
-FAILED := .pytest_cache/v/cache/lastfailed
-define RUN_TESTS
-@rm -f $(FAILED)
-$(PYTEST) -m '$(1)' || { [ $$? = 1 ] && echo "Failed above; once more, alone:" && \
-	files=$$($(BIN)/python -c 'import json; print(*{n.partition("::")[0] for n in json.load(open("$(FAILED)"))})') && \
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m '$(1)' -v --maxfail 1 $$files; }
-endef
-
 fast-tests: $(DEV) $(INTERFACES)
-	$(call RUN_TESTS,not slow)
+	$(PYTEST) -m 'not slow'
 
+# of a slow test's many processes one may be late on a busy machine: what fails runs once more, alone, with
+# its whole file, and both results are printed; what fails twice fails
+FAILED := .pytest_cache/v/cache/lastfailed
 slow-tests: $(DEV) $(INTERFACES)  ## the tests that `make test` leaves out
-	$(call RUN_TESTS,slow)
+	@rm -f $(FAILED)
+	$(PYTEST) -m slow || { [ $$? = 1 ] && echo "Failed above; once more, alone:" && \
+		files=$$($(BIN)/python -c 'import json; print(*{n.partition("::")[0] for n in json.load(open("$(FAILED)"))})') && \
+		OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -v --maxfail 1 $$files; }
 
 tiers: $(DEV) $(INTERFACES)  ## time all tests, one by one; list those whose marker `slow` is wrong
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q --tiers

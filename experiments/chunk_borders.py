@@ -89,7 +89,7 @@ class RememberingPipeline(Pipeline):
                 self.whole['last'][index] = shown[index]
                 continue
             shown[index] = self._remembered(first[index], tracked, index)
-            if shown[index] is first[index] or (shown[index] == self.whole['whole'][index]).all():
+            if (shown[index] == self.whole['whole'][index]).all():
                 self.seen['frames'][index] = frames[index[0]]
         return replace(found, masks=shown[:, :, None])
 

@@ -14,8 +14,7 @@ works on.
 Rows are tested on whole episodes from their first frame, as in the paper, and also chunk by chunk
 from recorded frames, which is named so. `--rates` trains each row with several learning rates for
 `--rate-clips` clips first, with the first seed, and goes on with the best: the one with the lowest
-loss at the end, in less than one pass of the clips, so that the loss is of clips that were not
-seen before.
+loss at the end, in less than one pass of the clips, so that few of these were seen before.
 
 Tables 1 to 3 are those of the last stage that all rows have; a learning curve shows all stages.
 The learning rate is constant after a short warm-up, so that a stage does not depend on those after
@@ -593,11 +592,15 @@ class PaperTables:
 
     def _waits(self, row: Row, seed: int) -> bool:
         """Whether a row starts from weights that this run has still to train."""
-        source = next((one for one in self.rows if one.name == row.starts_from), None)
-        if source is None or self.options.real_init not in self.stages:
+        will_be = any(one.name == row.starts_from for one in self.rows)
+        if not will_be or self.options.real_init not in self.stages:
             return False
-        made = self.stage_folder(source, seed, self.options.real_init) / self.product
-        return trained_steps(made) is None
+        return trained_steps(self._source(row, seed)) is None
+
+    def _source(self, row: Row, seed: int) -> Path:
+        """Return where the checkpoint that a row starts from is, or will be."""
+        source = next(one for one in ROWS if one.name == row.starts_from)
+        return self.stage_folder(source, seed, self.options.real_init) / self.product
 
     def _start(self, row: Row, seed: int) -> Path:
         """Return the checkpoint that a row starts from.
@@ -605,11 +608,10 @@ class PaperTables:
         Raises:
             ConfigError: the row of the simulated episodes has no such stage so far.
         """
-        source = next(one for one in ROWS if one.name == row.starts_from)
-        checkpoint = self.stage_folder(source, seed, self.options.real_init) / self.product
+        checkpoint = self._source(row, seed)
         if trained_steps(checkpoint) is None:
             raise ConfigError(
-                f"row '{row.name}' starts from row '{source.name}' with "
+                f"row '{row.name}' starts from row '{row.starts_from}' with "
                 f'{self.options.real_init} clips (--real-init), which is not trained so far; '
                 'name that stage in --clips, and run the same command again'
             )

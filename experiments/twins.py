@@ -69,7 +69,7 @@ def twins(episodes: Sequence[IndexedEpisode]) -> list[Pair]:
         for found in scenes.values()
         for failed in found.get('failure', ())
         for made in found.get('success', ())
-        if (starts := tuple(start for start in failed.starts if start in set(made.starts)))
+        if (starts := tuple(sorted({*failed.starts} & {*made.starts})))
     ]
 
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Iterator
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from test.support.scripts import imported_scripts
 
 
 @pytest.fixture(scope='module')
-def borders() -> ModuleType:
+def borders() -> Iterator[ModuleType]:
     """The experiment as a module."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        return __import__('chunk_borders')
+    with imported_scripts('chunk_borders') as (script,):
+        yield script
 
 
 def rectangle(top: int, left: int, height: int, width: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 import sys
 from types import ModuleType, SimpleNamespace
@@ -10,16 +11,14 @@ import numpy as np
 import pytest
 
 from mtv_world_ros.core.errors import ConfigError
-
-ROOT = Path(__file__).resolve().parents[2]
+from test.support.scripts import imported_scripts
 
 
 @pytest.fixture(scope='module')
-def lite() -> ModuleType:
+def lite() -> Iterator[ModuleType]:
     """The experiment as a module."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        return __import__('lite_features')
+    with imported_scripts('lite_features') as (script,):
+        yield script
 
 
 def evaluation(frames: np.ndarray, real: np.ndarray) -> SimpleNamespace:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import errno
 import json
 from pathlib import Path
@@ -23,21 +23,20 @@ from mtv_world_ros.evaluation.metrics.statistics import Estimate
 from mtv_world_ros.training.trainer import learning_rate
 from mtv_world_ros.training.training_config import load_training_config
 from test.support.launched import ENVIRONMENT
+from test.support.scripts import imported_scripts
 from test.support.sources import set_options, TINY_MODEL
 from test.support.wan_base import make_base, tiny_preset
 
-ROOT = Path(__file__).resolve().parents[2]
 TASK = 'stack_blocks_two'
 #: what the tests of the whole run train
 ROWS = 'mtv_world,single_view_low'
 
 
 @pytest.fixture(scope='module')
-def tables() -> ModuleType:
+def tables() -> Iterator[ModuleType]:
     """The experiment as a module."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        return __import__('paper_tables')
+    with imported_scripts('paper_tables') as (script,):
+        yield script
 
 
 @pytest.fixture(scope='module')
@@ -596,18 +595,9 @@ def test_the_learning_rate_with_the_lowest_loss_is_taken(tables, data: Path, tmp
         return 0
 
     options = tables.parser().parse_args(
-        words_of(
-            tmp_path,
-            data,
-            ROWS,
-            '--rates',
-            '3e-4,6e-4,1.2e-3',
-            '--rate-clips',
-            '2',
-            '--seeds',
-            '0,1',
-        )
-    )
+        words_of(tmp_path, data, ROWS, '--rates', '3e-4,6e-4,1.2e-3', '--rate-clips', '2',
+                 '--seeds', '0,1')
+    )  # fmt: skip
     run = tables.PaperTables(options, train)
     row = next(row for row in tables.ROWS if row.name == 'mtv_world')
     first, second = run.folder(row, 0), run.folder(row, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 import json
 from math import isfinite, isnan, nan
@@ -12,17 +13,16 @@ import pytest
 
 from mtv_world_ros.core.errors import ConfigError
 from mtv_world_ros.ranking.jobs import Result, StoredEstimate
+from test.support.scripts import imported_scripts
 
-ROOT = Path(__file__).resolve().parents[2]
 UNKNOWN = StoredEstimate.stated(nan, 'abstains')
 
 
 @pytest.fixture(scope='module')
-def pooled() -> ModuleType:
+def pooled() -> Iterator[ModuleType]:
     """The experiment as a module."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        return __import__('pooled_rankings')
+    with imported_scripts('pooled_rankings') as (script,):
+        yield script
 
 
 def result(task: str, final: bool, pictures: float, rule: float = 0.5) -> Result:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -14,16 +14,15 @@ from mtv_world_ros.data.recording import load_recording, Recording
 from mtv_world_ros.training.clips.episode_index import IndexedEpisode
 from mtv_world_ros.training.training_config import load_training_config
 from mtv_world_ros.vision.segmenters.colour import ColourSegmenter
+from test.support.scripts import imported_scripts
 
-ROOT = Path(__file__).resolve().parents[2]
 CONFIG = load_training_config('paper', {'optimizer.batch_size': 4})
 
 
 @pytest.fixture(scope='module')
-def module() -> ModuleType:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        return __import__('twins')
+def module() -> Iterator[ModuleType]:
+    with imported_scripts('twins') as (script,):
+        yield script
 
 
 @pytest.fixture(scope='module')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 import subprocess
 import sys
@@ -13,17 +14,17 @@ import torch
 from mtv_world_ros.model.tensor_files import open_tensors
 from mtv_world_ros.training.dry_run import step_cost
 from mtv_world_ros.training.training_config import load_training_config
+from test.support.scripts import imported_scripts
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope='module')
-def scripts() -> SimpleNamespace:
+def scripts() -> Iterator[SimpleNamespace]:
     """The benchmarks as modules."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / 'experiments'))
-        names = ('gpu', 'wan_floor', 'wan_import')
-        return SimpleNamespace(**{name: __import__(name) for name in names})
+    names = ('gpu', 'wan_floor', 'wan_import')
+    with imported_scripts(*names) as modules:
+        yield SimpleNamespace(**dict(zip(names, modules, strict=True)))
 
 
 @pytest.mark.slow
