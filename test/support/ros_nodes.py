@@ -74,8 +74,8 @@ CHUNK_S = 0.8
 ASK_AGAIN_S = 3.0
 #: an answer that has not come after this time is lost [s]
 ANSWER_LOST_S = 10.0
-#: a client that no service matches in this time is made anew, in a participant that discovers all
-#: services again: what discovery has lost once, a participant never learns [s]
+#: a client or reader that nothing matches in this time is made anew, in a participant that
+#: discovers everything again: what discovery has lost once, a participant never learns [s]
 MATCH_AGAIN_S = 12.0
 #: messages that subscriptions of tests keep: chunks are published in bursts, while a busy machine
 #: takes long to take them
@@ -169,6 +169,7 @@ class Client:
         depth=KEPT,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.VOLATILE,
+        node=None,
     ):
         def keep(message):
             self.received[topic].append(message)
@@ -176,8 +177,11 @@ class Client:
 
         profile = QoSProfile(depth=depth, reliability=reliability, durability=durability)
         if topic in self.subscriptions:  # of an earlier test: each message would come twice
-            self.node.destroy_subscription(self.subscriptions[topic])
-        self.subscriptions[topic] = self.node.create_subscription(kind, topic, keep, profile)
+            for caller in self.callers:  # of another node's subscription, it does nothing
+                caller.node.destroy_subscription(self.subscriptions[topic])
+        self.subscriptions[topic] = (node or self.node).create_subscription(
+            kind, topic, keep, profile
+        )
 
     def publish(self, topic, message, *, latched=False):
         """Publish reliably; the first time on a topic waits until the node is connected."""
@@ -222,7 +226,8 @@ class Client:
         """Subscribe to a topic of a node in this process, and wait until that node knows it.
 
         That a participant knows a publisher does not mean that the publisher knows its reader.
-        A reader that it does not know for long is made anew: discovery may have lost it.
+        A reader that it does not know for long is made anew, in a participant that it has still to
+        discover, as for a service.
         """
 
         def is_known():
@@ -232,11 +237,12 @@ class Client:
         self.wait(lambda: getattr(process, 'node', None), 'the node')
         end = time.monotonic() + TIMEOUT_S
         while True:
-            self.subscribe(kind, topic)
+            self.subscribe(kind, topic, node=self.callers[-1].node)
             with suppress(AssertionError):
                 self.wait(is_known, topic, MATCH_AGAIN_S)
                 return
             assert time.monotonic() < end, f'{topic} does not know its reader'
+            self.callers.append(_new_participant(f'client_{len(self.callers)}'))
 
     def wait_until_seen(self, process, stamp_ns):
         """Wait until a node in this process has the images of a moment, of all views.

@@ -607,6 +607,8 @@ def test_two_robots_and_two_players_do_not_meet(episode, launch, tmp_path, ros, 
     try:
         for name in heard:
             client.hear(heard[name], ros.REPORT, f'/{name}/world_model/report')
+        for name in heard:
+            client.hear(heard[name], ros.REPORT, '/diagnostics')
         spaces = [('--ros-args', '-r', f'__ns:=/{name}') for name in heard]
         first, second = (
             launch('player', episode, '--clock', '--lock-step', '--rate', rate, *space)
