@@ -160,7 +160,8 @@ ROWS = (
         for row in _SIMULATED
         if row.name in _REAL
     ),
-    # numbers of one robot's joints mean nothing for another: drawn trajectories alone carry over
+    # numbers of one robot's joints mean nothing for another: drawn trajectories alone can start
+    # another robot's training
     Row(
         name='real_mtv_world_after_simulation',
         title='MTV-World after the simulated episodes',
@@ -258,6 +259,9 @@ class PaperTables:
             ConfigError: options that do not fit together or to what is there.
         """
         self._check_before()
+        for row in ROWS:  # the tables read rows that were not asked for, too
+            for folder in sorted((self.out / 'rows' / row.name).glob('seed_*')):
+                check_method(folder, row)
         self.out.mkdir(parents=True, exist_ok=True)
         with locked(self.out, wait=True):
             check_settings(self.out / SETTINGS, self._settings())
@@ -1113,7 +1117,7 @@ def mean_over_groups(groups: Sequence[Sequence[float]]) -> Estimate:
 
 
 def check_method(folder: Path, row: Row) -> None:
-    """Write how a row is made; refuse a folder whose row was made otherwise.
+    """Write how a row that is begun or begins is made; refuse one that was made otherwise.
 
     Raises:
         ConfigError: names the row, both methods and what to do.

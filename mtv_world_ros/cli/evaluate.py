@@ -211,6 +211,8 @@ _J = (
     ('j_moving', 'J of moving objects', 'j_copy_moving'),
     ('j_object_mean', 'J of objects', 'j_copy_mean'),
 )
+#: J that what moves in imagination alone lowers, too
+_EITHER = 'j_moving_either'
 
 
 def in_short(summary: EvaluationSummary) -> str:
@@ -226,6 +228,8 @@ def in_short(summary: EvaluationSummary) -> str:
         for key, words, held in _J
         if isfinite(numbers[key].value)
     ][:1]
+    if isfinite(numbers[_EITHER].value):
+        said.append(f'of those that move in truth or imagination {cell(numbers[_EITHER])}')
     pictures = summary.pictures[None]
     if 'psnr' in pictures:
         psnr, held = (number(pictures[key].value, 1) for key in ('psnr', 'psnr_held'))

@@ -20,6 +20,7 @@ from mtv_world_ros.evaluation.metrics.jaccard_scores import (
     MOVING_RULE,
     ScoreRow,
 )
+from mtv_world_ros.evaluation.metrics.object_scores import COPY_RULE
 from mtv_world_ros.evaluation.metrics.picture_scores import Following, following, picture_estimates
 from mtv_world_ros.evaluation.metrics.statistics import Estimate, METHOD, summarise
 from mtv_world_ros.evaluation.metrics.success_agreement import agreement, Judgement
@@ -122,10 +123,15 @@ class EvaluationSummary:
         return load_rollout(path) if path.is_file() else None
 
     @cached_property
+    @property
+    def moving_rule(self) -> str:
+        """Definition of an object that moves, and whose masks tell it."""
+        source = "the simulator's" if all(r.has_ids for r in self.results) else "the segmenter's"
+        return f'{MOVING_RULE.format(source=source)}; {COPY_RULE}'
+
     def metrics(self) -> dict[str, Any]:
         """Content of metrics.json."""
         seconds = float(np.mean([result.seconds_per_chunk for result in self.results]))
-        source = "the simulator's" if all(r.has_ids for r in self.results) else "the segmenter's"
         return {
             'name': self.name,
             'label': self.label,
@@ -140,7 +146,7 @@ class EvaluationSummary:
             **self.settings,
             'model': asdict(self.spec),
             'num_episodes_with_true_masks': self.num_true,
-            'moving_rule': MOVING_RULE.format(source=source),
+            'moving_rule': self.moving_rule,
             'follows_commands': asdict(self.following),
             'dreams': {**asdict(self.dreams), 'grasp_rule': GRASP_RULE},
             'pictures': {

@@ -191,7 +191,7 @@ def dreams_table(summary: EvaluationSummary) -> Table:
     return Table(
         head=['motion of objects', 'cases (share, 95 % Wilson interval)'],
         rows=[[words, share.text] for words, share in rows.items()],
-        caption=f'Grasps and motion of objects: {GRASP_RULE}',
+        caption=f'Grasps and motion of objects: {GRASP_RULE}; {summary.moving_rule}',
     )
 
 

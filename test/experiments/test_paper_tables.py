@@ -583,6 +583,19 @@ def test_a_row_of_another_method_version_is_refused_by_name(tables, tmp_path: Pa
     tables.check_method(tmp_path, row)  # its own method, again
 
 
+def test_a_folder_with_a_row_of_another_method_version_is_refused_before_anything_is_done(
+    tables, data: Path, tmp_path: Path, capsys
+):
+    """Also where another row is asked for, as the tables read all that are there."""
+    (tmp_path / 'rows' / 'ee_mlp' / 'seed_1' / 'training').mkdir(parents=True)
+    (tmp_path / 'settings.json').write_text('{"tasks": []}')  # of version 1, without `rates`
+    recorder = Recorder()
+    assert tables.main(words_of(tmp_path, data, 'mtv_world'), recorder) == 1
+    assert not recorder.commands
+    said = capsys.readouterr().err
+    assert "row 'ee_mlp' in '" in said and 'version 1' in said and '--out' in said
+
+
 def test_the_learning_rate_with_the_lowest_loss_is_taken(tables, data: Path, tmp_path: Path):
     losses = {0.0003: 0.5, 0.0006: 0.2, 0.0012: 0.4}
 

@@ -118,6 +118,16 @@ def test_places_of_an_attempt_are_those_of_the_grasp_and_of_the_miss():
         assert (shown & ~missed[:, closed:]).sum() == 0
 
 
+def test_an_object_that_was_never_seen_has_no_place_and_one_that_enters_later_has_its_last():
+    openings = np.where(np.arange(_FRAMES) < _CLOSED - 1, 1.0, 0.2)
+    tools = tools_in_views(_motion(), 0)
+    masks = _masks(_STAYS)
+    whole = attempted_places(masks, openings, tools)
+    assert not attempted_places(np.zeros_like(masks), openings, tools).any()
+    masks[:, :, 0] = False
+    assert (attempted_places(masks, openings, tools) == whole).all()
+
+
 def test_what_a_tool_lets_go_would_stay_where_it_opened():
     frames, opened = np.arange(_FRAMES), _FRAMES - 3
     openings = np.where((frames < _CLOSED - 1) | (frames >= opened), 1.0, 0.2)

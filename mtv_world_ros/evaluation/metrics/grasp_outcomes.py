@@ -67,6 +67,8 @@ def grasp_outcomes(
 ) -> tuple[GraspOutcome, ...]:
     """Return the outcomes of all attempts in a stretch whose tool then travels far enough.
 
+    An object that imagination never shows is not grasped there.
+
     Args:
         motion: robot and cameras at the 1 + T frames of the stretch.
         names: names of the O objects.
@@ -86,8 +88,8 @@ def grasp_outcomes(
                 goes_along(masks[:, nearest], tools, closed, opened, settings)
                 for masks in (real, imagined)
             ]
-            if Hold.NOT_TOLD in went:
-                continue
+            if went[0] is Hold.NOT_TOLD:
+                continue  # what imagination never shows does not go along there
             found.append(
                 GraspOutcome(
                     stretch=stretch,
@@ -164,7 +166,11 @@ class Dreams:
 
     @property
     def line(self) -> str:
-        """Both shares of grasps on one line; empty if nothing was grasped at."""
-        if not self.dreamt.count + self.missed.count:
-            return ''
-        return f'missed grasps dreamt: {self.dreamt.text}; grasps missed: {self.missed.text}'
+        """All shares that have cases on one line; empty if nothing was grasped at or moved."""
+        shares = {
+            'missed grasps dreamt': self.dreamt,
+            'grasps missed': self.missed,
+            'of what moves in imagination, moves in truth': self.precision,
+            'of what moves in truth, moves in imagination': self.recall,
+        }
+        return '; '.join(f'{words}: {s.text}' for words, s in shares.items() if s.count)

@@ -123,13 +123,20 @@ def _boundary(mask: BoolArray) -> BoolArray:
 COPY_AREA = 1 / 3
 #: distance from the first mask that is elsewhere [fraction of image width]
 COPY_DISTANCE = 0.03
+#: definition of what else moves in imagination, for readers of the numbers
+COPY_RULE = (
+    f'in imagination it also moves if {COPY_AREA:.0%} of its first area is seen more than '
+    f'{COPY_DISTANCE:.0%} of the image width away from its first mask in two frames; an object '
+    'that the first frame does not show has no place to move from, and counts as one that stays'
+)
 
 
 def displaced_objects(masks: BoolArray, first: BoolArray) -> BoolArray:
     """Return (V, O) True for objects that appear away from their first mask in two frames or more.
 
     A copy that appears elsewhere while the object itself stays counts, too; `moving_objects` does
-    not see it.
+    not see it. Of an object that frame 0 does not show nothing tells a move from a hand that
+    uncovers it: it counts as one that stays, here and in `moving_objects`.
 
     Args:
         masks: (V, O, T, H, W) masks in the frames.

@@ -80,6 +80,27 @@ def test_an_object_without_a_mask_is_not_attempted():
     assert _outcome(empty, empty) == ()
 
 
+def _entered(masks, frame=2):
+    """Return the masks, empty before a frame."""
+    masks[:, :, :frame] = False
+    return masks
+
+
+def test_an_object_that_enters_later_is_judged_from_where_it_was_seen_last():
+    (found,) = _outcome(_entered(_masks(_GOES)), _entered(_masks(_GOES)))
+    assert (found.real, found.imagined) == (True, True)
+    (found,) = _outcome(_entered(_masks(_STAYS)), _entered(_masks(_GOES)))
+    assert (found.real, found.imagined) == (False, True)
+
+
+def test_a_grasp_of_an_object_that_imagination_never_shows_is_missed():
+    nothing = np.zeros_like(_masks(_STAYS))
+    (found,) = _outcome(_entered(_masks(_GOES)), nothing)
+    assert (found.real, found.imagined) == (True, False)
+    (found,) = _outcome(_entered(_masks(_STAYS)), nothing)
+    assert (found.real, found.imagined) == (False, False)
+
+
 def test_shares_of_dreams_count_misses_and_grasps_apart():
     def attempt(real, imagined):
         return GraspOutcome(stretch=0, frame=1, arm=0, name='a', real=real, imagined=imagined)
@@ -90,6 +111,13 @@ def test_shares_of_dreams_count_misses_and_grasps_apart():
     assert (found.missed.hits, found.missed.count) == (0, 1)
     assert found.precision.value == found.recall.value == 0.5
     assert found.line.startswith('missed grasps dreamt: 1 of 2 (0.50 [')
+    assert '; of what moves in imagination, moves in truth: 1 of 2 (' in found.line
+
+
+def test_nothing_that_was_grasped_at_leaves_the_shares_of_motion():
+    assert Dreams.of([], [(True, False)]).line == (
+        'of what moves in truth, moves in imagination: 0 of 1 (0.00 [0.00, 0.79])'
+    )
 
 
 def test_no_attempt_has_no_line():

@@ -6,6 +6,7 @@ import pytest
 from mtv_world_ros.evaluation.metrics.jaccard_scores import keep_doubts
 from mtv_world_ros.evaluation.metrics.object_scores import (
     boundary_f,
+    displaced_objects,
     moving_objects,
     object_scores,
 )
@@ -67,6 +68,22 @@ def test_hiding_an_object_is_no_motion_but_displacing_it_is():
     true = np.array([[[a, hidden], [a, gone]]])
     assert moving_objects(true, np.array([[a, a]])).tolist() == [[False, True]]
     assert not moving_objects(np.array([[[a]]]), np.array([[hidden]])).any()
+
+
+def test_a_copy_elsewhere_is_a_displaced_object():
+    a, gone = square(0, 0), square(40, 20)
+    first = np.array([[a]])
+    assert displaced_objects(np.array([[[a | gone, a | gone]]]), first).all()
+    assert not displaced_objects(np.array([[[a | gone, a]]]), first).any()  # in one frame
+
+
+def test_an_object_that_the_first_frame_does_not_show_has_no_place_to_move_from():
+    """It may enter, or a hand may uncover it: nothing tells."""
+    a, gone = square(0, 0), square(40, 20)
+    entered = np.array([[[np.zeros_like(a), a, gone, gone]]])
+    nothing = np.zeros_like(entered[:, :, 0])
+    assert not moving_objects(entered, nothing).any()
+    assert not displaced_objects(entered, nothing).any()
 
 
 def counted_f(pred, true):
