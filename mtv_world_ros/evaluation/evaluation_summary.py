@@ -129,6 +129,7 @@ class EvaluationSummary:
         source = "the simulator's" if all(r.has_ids for r in self.results) else "the segmenter's"
         return f'{MOVING_RULE.format(source=source)}; {COPY_RULE}'
 
+    @property
     def metrics(self) -> dict[str, Any]:
         """Content of metrics.json."""
         seconds = float(np.mean([result.seconds_per_chunk for result in self.results]))
