@@ -122,14 +122,13 @@ class EvaluationSummary:
         path = rollout_path(self.folder, episode)
         return load_rollout(path) if path.is_file() else None
 
-    @cached_property
     @property
     def moving_rule(self) -> str:
         """Definition of an object that moves, and whose masks tell it."""
         source = "the simulator's" if all(r.has_ids for r in self.results) else "the segmenter's"
         return f'{MOVING_RULE.format(source=source)}; {COPY_RULE}'
 
-    @property
+    @cached_property
     def metrics(self) -> dict[str, Any]:
         """Content of metrics.json."""
         seconds = float(np.mean([result.seconds_per_chunk for result in self.results]))
