@@ -166,7 +166,9 @@ class Dreams:
 
     @property
     def line(self) -> str:
-        """All shares that have cases on one line; empty if nothing was grasped at or moved."""
+        """All shares that have cases on one line; empty if nothing was grasped at."""
+        if not self.dreamt.count + self.missed.count:
+            return ''
         shares = {
             'missed grasps dreamt': self.dreamt,
             'grasps missed': self.missed,
