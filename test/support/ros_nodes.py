@@ -242,7 +242,7 @@ class Client:
                 self.wait(is_known, topic, MATCH_AGAIN_S)
                 return
             assert time.monotonic() < end, f'{topic} does not know its reader'
-            self.callers.append(_new_participant(f'client_{len(self.callers)}'))
+            self._add_participant()
 
     def wait_until_seen(self, process, stamp_ns):
         """Wait until a node in this process has the images of a moment, of all views.
@@ -295,9 +295,13 @@ class Client:
                 if time.monotonic() > end:
                     raise AssertionError(f'{error}; {self._known_ends(name)}') from error
                 self._destroy_client(name)
-                self.callers.append(_new_participant(f'client_{len(self.callers)}'))
+                self._add_participant()
             else:
                 return client
+
+    def _add_participant(self):
+        """What is made on the newest one is discovered from the start."""
+        self.callers.append(_new_participant(f'client_{len(self.callers)}'))
 
     def _destroy_client(self, name):
         client = self.services.pop(name)

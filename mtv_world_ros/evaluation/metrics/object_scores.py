@@ -135,8 +135,8 @@ def displaced_objects(masks: BoolArray, first: BoolArray) -> BoolArray:
     """Return (V, O) True for objects that appear away from their first mask in two frames or more.
 
     A copy that appears elsewhere while the object itself stays counts, too; `moving_objects` does
-    not see it. Of an object that frame 0 does not show nothing tells a move from a hand that
-    uncovers it: it counts as one that stays, here and in `moving_objects`.
+    not see it. An object that frame 0 does not show may enter later, or a hand may uncover it; it
+    counts as one that stays, here and in `moving_objects`.
 
     Args:
         masks: (V, O, T, H, W) masks in the frames.
