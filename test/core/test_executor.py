@@ -149,8 +149,10 @@ def make_adder():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures('ray_environment')
-def test_what_a_job_raises_on_ray_is_raised_here(make_adder):
-    assert dict(run_all([1, 2], make_adder, Workers(ray=''))) == {1: 2, 2: 3}
+def test_what_a_job_raises_on_ray_is_raised_here(make_adder, tmp_path):
+    assert dict(run_all([1, 2], make_adder, Workers(ray='', writes=tmp_path))) == {1: 2, 2: 3}
+    # the files that tell machines the folder of results do not stay
+    assert list(tmp_path.iterdir()) == []
     with pytest.raises(MtvWorldError, match='-1 is below 0'):
         dict(run_all([-1], make_adder, Workers(ray='')))
 
@@ -186,13 +188,6 @@ def test_a_cluster_of_another_version_is_an_error(make_adder, ray_environment, m
     monkeypatch.setattr(ray_environment, 'init', refuse)
     with pytest.raises(ConfigError, match=r'another version than the .*Ray: 2\.9\.0'):
         dict(run_all([1], make_adder, Workers(ray='192.0.2.1:6392')))
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures('ray_environment')
-def test_files_that_tell_machines_the_folder_of_results_do_not_stay(make_adder, tmp_path):
-    assert dict(run_all([1], make_adder, Workers(ray='', writes=tmp_path))) == {1: 2}
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_threads_are_those_asked_for_or_what_ray_reserves():

@@ -103,6 +103,7 @@ def test_the_command_scores_held_out_episodes_as_evaluate_does(episode, tmp_path
 def test_two_processes_share_the_held_out_episodes(tmp_path):
     data, out, scores = (tmp_path / name for name in ('data', 'run', 'scores'))
     words = ['collect', '--task', 'stack_blocks_two', '--episodes', '8', '--out', str(data)]
+    words += ['--width', '96', '--height', '72']
     assert main([*words, '--seed', '0']) == 0
     test = read_json(data / 'dataset.json')['splits']['test']
     assert len(test) == 4

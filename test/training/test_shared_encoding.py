@@ -18,7 +18,7 @@ from test.support.launched import rank_pid, start_torchrun, torchrun
 from test.support.wan_base import make_base, tiny_preset
 
 #: pictures that take some time to encode, and a clip from nearly every frame
-SLOW = {'width': 160, 'height': 128, 'clip_stride_s': 0.2}
+SLOW = {'width': 96, 'height': 80, 'clip_stride_s': 0.4}
 #: runs a command; in process 1 every file of a folder meets a full disk, which has no inode left
 FULL_IN_ONE = """#!/bin/sh
 folder=$1
