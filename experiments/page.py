@@ -28,7 +28,7 @@ import numpy as np
 
 from mtv_world_ros.cli.shared_options import machine
 from mtv_world_ros.core.files import content_digest
-from mtv_world_ros.core.processes import let_threads_sleep
+from mtv_world_ros.core.processes import prepare_process
 from mtv_world_ros.model.checkpoint import checkpoint_folder
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,7 +80,7 @@ def parse_arguments(
     more: Callable[[argparse.ArgumentParser], None] = lambda parser: None,
 ) -> argparse.Namespace:
     """The options that all benchmarks share, --repeats, --seed, --machine, --out, and `more`."""
-    let_threads_sleep()  # before torch is loaded
+    prepare_process()  # before torch is loaded
     parser = argparse.ArgumentParser(
         description=text, formatter_class=argparse.RawDescriptionHelpFormatter
     )

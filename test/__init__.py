@@ -1,5 +1,5 @@
 """Tests of the package; helpers that tests share are in `test.support`."""
 
-from mtv_world_ros.core.processes import let_threads_sleep
+from mtv_world_ros.core.processes import prepare_process
 
-let_threads_sleep()  # as commands and nodes do, before torch is loaded
+prepare_process()  # as commands and nodes do, before torch is loaded

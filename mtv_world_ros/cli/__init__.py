@@ -44,8 +44,8 @@ from mtv_world_ros.core.files import check_name, check_output  # noqa: E402
 from mtv_world_ros.core.processes import (  # noqa: E402
     ended_by_signals,
     is_helper_rank,
-    let_threads_sleep,
     prepare_output,
+    prepare_process,
     stopped_by_sigterm,
 )
 from mtv_world_ros.core.shown_text import MOST_OF_ERROR, shown  # noqa: E402
@@ -276,7 +276,7 @@ def main(argv: list[str] | None = None) -> int:
 
     That is 1 for an error of the user's or of the disk, and 128 + n where signal n ended it.
     """
-    let_threads_sleep()
+    prepare_process()
     prepare_output()
     try:
         with ended_by_signals('mtv-world'):

@@ -15,7 +15,7 @@ from typing import Any, TYPE_CHECKING, TypeVar
 import uuid
 
 from mtv_world_ros.core.errors import ConfigError, MissingPackageError, MtvWorldError
-from mtv_world_ros.core.processes import let_threads_sleep
+from mtv_world_ros.core.processes import prepare_process
 from mtv_world_ros.core.progress import Progress
 from mtv_world_ros.core.worker_pool import made_run, Run
 
@@ -145,7 +145,7 @@ class _Actor:
         needed: Sequence[Path],
         marker: Path | None,
     ) -> None:
-        let_threads_sleep()
+        prepare_process()
         with suppress(OSError):
             os.chdir(folder)
         self._problem = _unseen(needed, marker)

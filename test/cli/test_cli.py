@@ -49,14 +49,14 @@ def test_help_does_not_load_the_model(tmp_path):
         assert command in done.stdout.decode()
 
 
-def test_numpy_starts_no_threads():
-    """Those of its matrix products spin while they wait; ours are small."""
+def test_numpy_starts_no_threads_and_cycles_are_searched_for_seldom():
+    """Threads of NumPy's matrix products spin while they wait; ours are small."""
     code = (
-        'from mtv_world_ros.core.processes import let_threads_sleep\nlet_threads_sleep()\n'
-        'import numpy, os\nprint(len(os.listdir("/proc/self/task")))'
+        'from mtv_world_ros.core.processes import prepare_process\nprepare_process()\n'
+        'import gc, numpy, os\nprint(len(os.listdir("/proc/self/task")), gc.get_threshold()[0])'
     )
     kept = {name: text for name, text in os.environ.items() if 'NUM_THREADS' not in name}
-    assert subprocess.check_output([sys.executable, '-c', code], env=kept) == b'1\n'
+    assert subprocess.check_output([sys.executable, '-c', code], env=kept) == b'1 5000\n'
 
 
 def test_a_command_that_left_says_where_it_is(capsys):
