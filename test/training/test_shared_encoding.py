@@ -17,8 +17,10 @@ from mtv_world_ros.training.training_config import load_training_config
 from test.support.launched import rank_pid, start_torchrun, torchrun
 from test.support.wan_base import make_base, tiny_preset
 
+#: clips for both processes
+QUICK = {'width': 64, 'height': 64, 'clip_stride_s': 0.8}
 #: pictures that take some time to encode, and a clip from nearly every frame
-SLOW = {'width': 96, 'height': 80, 'clip_stride_s': 0.4}
+SLOW = {'width': 160, 'height': 128, 'clip_stride_s': 0.2}
 #: runs a command; in process 1 every file of a folder meets a full disk, which has no inode left
 FULL_IN_ONE = """#!/bin/sh
 folder=$1
@@ -31,13 +33,11 @@ exec "$@"
 """
 
 
-@pytest.fixture(scope='module')
-def words(episode, tmp_path_factory) -> list[str]:
+def words_of(episode: Path, folder: Path, video: dict[str, float]) -> list[str]:
     """A training of one step with a latent cache, without the folders that it writes."""
-    folder = tmp_path_factory.mktemp('base')
     preset = tiny_preset(folder)
     values = yaml.safe_load(preset.read_text())
-    values['video'] |= SLOW
+    values['video'] |= video
     values['optimizer']['steps'] = 1
     preset.write_text(yaml.safe_dump(values))
     base = make_base(folder, load_training_config(preset))
@@ -68,14 +68,15 @@ def check_goes_on(words: list[str], out: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_disk_that_is_full_in_one_process_is_named_and_the_others_clips_stay(words, tmp_path):
+def test_a_disk_that_is_full_in_one_process_is_named_and_the_others_clips_stay(episode, tmp_path):
     if os.geteuid() != 0 or subprocess.run(['unshare', '--mount', 'true']).returncode:
         pytest.skip('only root can mount a disk for one process')
     out, latents, program = tmp_path / 'out', tmp_path / 'latents', tmp_path / 'full_in_one'
     latents.mkdir()
     program.write_text(FULL_IN_ONE)
     program.chmod(0o755)
-    words = [*words, '--out', str(out), '--latent-cache', str(latents)]
+    words = words_of(episode, tmp_path, QUICK)
+    words += ['--out', str(out), '--latent-cache', str(latents)]
     status, said, errors = torchrun(2, words, through=[str(program), str(latents)])
     assert status == 1, errors
     assert f"latent cache '{latents}" in errors and 'No space left on device' in errors
@@ -86,9 +87,10 @@ def test_a_disk_that_is_full_in_one_process_is_named_and_the_others_clips_stay(w
 
 
 @pytest.mark.slow
-def test_a_process_killed_while_it_encodes_is_named_and_the_others_clips_stay(words, tmp_path):
+def test_a_process_killed_while_it_encodes_is_named_and_the_others_clips_stay(episode, tmp_path):
     out, latents, end_s = tmp_path / 'out', tmp_path / 'latents', time.monotonic() + 600
-    words = [*words, '--out', str(out), '--latent-cache', str(latents)]
+    words = words_of(episode, tmp_path, SLOW)
+    words += ['--out', str(out), '--latent-cache', str(latents)]
     with start_torchrun(2, words) as launcher:
         while not latents.exists():  # made when a clip is encoded
             assert launcher.poll() is None and time.monotonic() < end_s
