@@ -151,7 +151,7 @@ def test_distances_asked_for_later_are_measured_alone(
 
 
 @pytest.mark.slow
-def test_a_row_of_wan_is_an_adapter_that_two_processes_train(
+def test_rows_of_wan_are_adapters_that_two_processes_train(
     tables: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     for name, value in ENVIRONMENT.items():
@@ -161,19 +161,19 @@ def test_a_row_of_wan_is_an_adapter_that_two_processes_train(
     out, latents = tmp_path / 'out', tmp_path / 'latents'
     launcher = f'{sys.executable} -m torch.distributed.run --standalone --nproc-per-node 2'
     words = [
-        '--out', str(out), '--data', str(data), '--tasks', TASK, '--clips', '4',
-        '--rows', 'mtv_world',
+        '--out', str(out), '--data', str(data), '--tasks', TASK, '--clips', '4', '--rows', ROWS,
         '--test-episodes', '1', '--zero-shot-episodes', '0', '--no-lite-features',
         '--preset', str(preset), '--init', str(base), '--latent-cache', str(latents),
         '--launcher', launcher,
     ]  # fmt: skip
     tested = Recorder()
     assert tables.main(words, tested) == 0
-    adapter = out / 'rows' / 'mtv_world' / 'seed_0' / 'clips_000004' / 'adapter'
-    assert (adapter / 'pytorch_lora_weights.safetensors').is_file()
-    trained = json.loads((adapter / 'world_model.json').read_text())['trained_on']
-    assert trained['steps'] == 2  # of two clips
-    assert any((latents / 'mtv_world').iterdir())
+    for row in ROWS.split(','):
+        adapter = out / 'rows' / row / 'seed_0' / 'clips_000004' / 'adapter'
+        assert (adapter / 'pytorch_lora_weights.safetensors').is_file()
+        trained = json.loads((adapter / 'world_model.json').read_text())['trained_on']
+        assert trained['steps'] == 2  # of two clips
+        assert any((latents / row).iterdir())
     # trainings are of the launcher, tests of this process, with the adapter
     assert {command[0] for command in tested.commands} == {'evaluate'}
     assert all('--adapter' in command for command in tested.commands)

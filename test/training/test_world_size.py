@@ -66,7 +66,7 @@ def kill_second(out: Path, words: list[str]) -> tuple[int, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ('first', 'then', 'count'), [([], [], 1), (SHARDED, SHARDED, 3), (SHARDED, [], 1)]
+    ('first', 'then', 'count'), [([], [], 4), (SHARDED, SHARDED, 3), (SHARDED, [], 1)]
 )
 def test_a_killed_process_is_named_and_another_count_goes_on(
     episode, whole, tmp_path, first, then, count
